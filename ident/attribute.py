@@ -1,0 +1,197 @@
+"""From a discrepancy to causes: detect, score, refit, compare, look again, stop.
+
+Each round screens every hypothesis at every place against the current model, refits the few that
+explain most together with the baseline and all causes found before, and weighs them by their
+evidence. What is left over at the end decides whether the names can be trusted: decoys for what
+the catalogue lacks compete with the names, and a residual far above the noise takes probability
+from all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.stats
+
+from ident.extended import Effect, Model, predict
+from ident.graybox import parameter_names
+from ident.hypotheses import Hypothesis, catalogue
+from ident.screening import Score, screen
+from ident.torque_fit import ANNEALING, Fit, Problem, fit
+
+DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
+DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
+REFITS = 8  # candidates refitted in a round
+PER_EFFECT = 2  # of one effect, at most
+KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
+TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share model error
+MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
+MIN_SHARE = 0.02  # share of the discrepancy that a cause must explain
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A refitted hypothesis: the model with it, and its evidence against the others."""
+
+    hypothesis: Hypothesis
+    fit: Fit
+    log_evidence: float
+    probability: float = 0.0
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of attribution: what competed, and who won."""
+
+    before: Fit
+    candidates: tuple[Candidate, ...]
+    scores: tuple[Score, ...]
+    scale: float
+
+
+@dataclass(frozen=True)
+class Attribution:
+    """Result: the baseline fit, rounds, and the final fit."""
+
+    baseline: Fit
+    detected: bool
+    p_value: float
+    rounds: tuple[Round, ...]
+    final: Fit
+    unknown: bool
+
+    @property
+    def left_share(self) -> float:
+        """Share of the discrepancy (excess over noise) that no cause explains."""
+        before = max(self.baseline.chi2_per_dof - 1.0, 1e-12)
+        return float(np.clip((self.final.chi2_per_dof - 1.0) / before, 0.0, 1.0))
+
+
+def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None) -> Fit:
+    """Baseline parameters of the gray-box without effects."""
+    names = parameter_names(problem.structure.robot)
+    start = Model(problem.structure, problem.nominal)
+    return fit(problem, start, base_names=names, annealing=ANNEALING, progress=progress)
+
+
+def discrepancy_p_value(result: Fit) -> float:
+    """Probability of a cost this large by noise alone (chi-square, Wilson-Hilferty in the tail)."""
+    dof = max(result.count - len(result.names), 1)
+    return float(scipy.stats.chi2.sf(result.cost, dof))
+
+
+def attribute(
+    problem: Problem,
+    baseline: Fit,
+    *,
+    max_causes: int = 4,
+    hypotheses: Sequence[Hypothesis] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Attribution:
+    """Find the causes of what the baseline does not explain."""
+    p_value = discrepancy_p_value(baseline)
+    detected = p_value < DETECTION_LEVEL and baseline.chi2_per_dof > DETECTION_EXCESS
+    hypotheses = tuple(hypotheses if hypotheses is not None else catalogue(problem.structure))
+    current, rounds, unknown = baseline, [], False
+    while detected and len(rounds) < max_causes and current.chi2_per_dof > DETECTION_EXCESS:
+        if progress is not None:
+            progress(f"cause {len(rounds) + 1}: screening {len(hypotheses)} hypotheses")
+        found = attribute_once(problem, current, hypotheses, progress=progress)
+        if not found.candidates:
+            break
+        best = found.candidates[0]
+        fall = (current.cost - best.fit.cost) / found.scale
+        share = (current.cost - best.fit.cost) / max(baseline.cost - baseline.count, 1.0)
+        if fall < MIN_EVIDENCE or share < MIN_SHARE:
+            break
+        if best.hypothesis.decoy:
+            unknown = True
+            rounds.append(found)
+            break
+        rounds.append(found)
+        current = best.fit
+        taken = {e.hypothesis.key for e in current.model.effects}
+        hypotheses = tuple(h for h in hypotheses if h.key not in taken)
+    return Attribution(baseline, detected, p_value, tuple(rounds), current, unknown)
+
+
+def attribute_once(
+    problem: Problem,
+    current: Fit,
+    hypotheses: Sequence[Hypothesis],
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> Round:
+    """One round: screen all, refit the best, weigh them."""
+    preds = [
+        predict(current.model, g, problem.sampling, W=W, steps=0)
+        for g, W in zip(problem.groups, current.remainders, strict=True)
+    ]
+    scores = screen(problem, current, preds, hypotheses)
+    names = parameter_names(problem.structure.robot)
+    candidates = []
+    chosen = choose(scores)
+    for i, score in enumerate(chosen):
+        if progress is not None:
+            h = score.hypothesis
+            progress(f"refit {i + 1}/{len(chosen)}: {h.effect} at {h.place}")
+        effect = Effect(score.hypothesis, clip_to_bounds(score))
+        model = replace(current.model, effects=(*current.model.effects, effect))
+        try:
+            result = fit(
+                problem,
+                model,
+                base_names=names,
+                iterations=10,
+                weights=current.weights,
+                remainders=current.remainders,
+            )
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        candidates.append(Candidate(score.hypothesis, result, 0.0))
+    if not candidates:
+        return Round(current, (), tuple(scores), 1.0)
+    best_cost = min(c.fit.cost for c in candidates)
+    scale = max(1.0, best_cost / current.count)
+    weighed = weigh(candidates, scale, current.count)
+    return Round(current, tuple(weighed), tuple(scores), scale)
+
+
+def choose(scores: Sequence[Score]) -> list[Score]:
+    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times."""
+    out: list[Score] = []
+    top = scores[0].gain if scores else 0.0
+    for score in scores:
+        same = sum(s.hypothesis.effect == score.hypothesis.effect for s in out)
+        if score.start is None or same >= PER_EFFECT or score.gain < KEEP_RATIO * top:
+            continue
+        out.append(score)
+        if len(out) == REFITS:
+            break
+    return out
+
+
+def clip_to_bounds(score: Score) -> np.ndarray:
+    """The start of a refit within the bounds of the parameters."""
+    return np.array(
+        [np.clip(v, q.lower, q.upper) for v, q in zip(score.start, score.hypothesis.parameters, strict=True)]
+    )
+
+
+def weigh(candidates: Sequence[Candidate], scale: float, count: int) -> list[Candidate]:
+    """Probabilities from tempered evidence: cost and number of parameters (BIC), best first."""
+    evidence = np.array(
+        [
+            -0.5 * c.fit.cost / scale - 0.5 * sum(not q.nuisance for q in c.hypothesis.parameters) * np.log(count)
+            for c in candidates
+        ]
+    )
+    evidence = (evidence - evidence.max()) / TEMPER
+    probability = np.exp(evidence) / np.exp(evidence).sum()
+    out = [
+        replace(c, log_evidence=float(e), probability=float(p))
+        for c, e, p in zip(candidates, evidence, probability, strict=True)
+    ]
+    return sorted(out, key=lambda c: -c.probability)

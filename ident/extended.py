@@ -1,0 +1,200 @@
+"""The gray-box with effects: prediction of the recorded torque, and its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.graybox import Parameters, Structure, damping_diagonal, stiffness_diagonal
+from ident.hypotheses import kernels
+from ident.hypotheses.hypothesis import Hypothesis
+from ident.hypotheses.structure import Change, apply_change
+from ident.inverse import (
+    REMAINDER_STEPS,
+    Motion,
+    Plane,
+    Sampling,
+    Solution,
+    Torques,
+    make_plane,
+    solve,
+    true_position,
+)
+from ident.records import Group
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A hypothesis with values for its parameters (external units)."""
+
+    hypothesis: Hypothesis
+    p: np.ndarray
+
+    def value(self, name: str) -> float:
+        return float(self.p[[q.name for q in self.hypothesis.parameters].index(name)])
+
+
+@dataclass(frozen=True)
+class Model:
+    """A chain, baseline parameters and effects."""
+
+    structure: Structure
+    par: Parameters
+    effects: tuple[Effect, ...] = ()
+
+    def built(self) -> tuple[Structure, Parameters]:
+        """Chain and parameters with the effects that change them."""
+        change = Change()
+        for effect in self.effects:
+            if effect.hypothesis.channel == "model":
+                change = change + effect.hypothesis.options["change"](effect.p)
+        return apply_change(self.structure, self.par, change)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a model predicts for a group, and what it was computed with."""
+
+    structure: Structure
+    par: Parameters
+    plane: Plane
+    solution: Solution
+    U: np.ndarray
+
+    def motion(self, group: Group) -> Motion:
+        return Motion(group, self.solution, self.par)
+
+
+def predict(
+    model: Model, group: Group, sampling: Sampling, *, W: np.ndarray | None = None, steps: int | None = None
+) -> Prediction:
+    """Recorded motor torque along the measured motion of a group, effects included.
+
+    Args:
+        W: (S, L, N) geometric remainder to start from (of an earlier prediction with the same
+            chain); None starts cold.
+        steps: fixed-point steps on it; ``REMAINDER_STEPS`` cold and 0 warm where None.
+    """
+    structure, par = model.built()
+    plane = make_plane(structure, par, group, sampling)
+    return predict_at(model, structure, par, plane, group, sampling, W=W, steps=steps)
+
+
+def predict_at(
+    model: Model,
+    structure: Structure,
+    par: Parameters,
+    plane: Plane,
+    group: Group,
+    sampling: Sampling,
+    *,
+    W: np.ndarray | None = None,
+    steps: int | None = None,
+) -> Prediction:
+    """``predict`` with the linear arm already at hand."""
+    if steps is None:
+        steps = REMAINDER_STEPS if W is None else 0
+    if W is not None and W.shape[-1] != structure.n_coordinates:
+        W, steps = None, max(steps, REMAINDER_STEPS)
+    Q = true_position(group, par, sampling)
+    by_channel: dict[str, list[Effect]] = {}
+    for effect in model.effects:
+        by_channel.setdefault(effect.hypothesis.channel, []).append(effect)
+    for effect in by_channel.get("position", []):
+        j = effect.hypothesis.joint
+        bare = Solution(Q, Q, Q, Q, Q, Q, Torques())
+        Q = Q.copy()
+        Q[..., j] += effect.hypothesis.law(effect.p, Motion(group, bare, par), j, par.stiffness[j])
+    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, steps=steps)
+    inner = by_channel.get("link", []) + by_channel.get("spring", [])
+    for _ in range(2 if len(inner) > 1 else bool(inner)):
+        torques = _inner_torques(structure, par, plane, group, solution, inner)
+        solution = solve(
+            structure, par, plane, group, sampling, Q=Q, W=solution.W, torques=torques, steps=min(steps, 2)
+        )
+    U = solution.U
+    motor = by_channel.get("motor", [])
+    if motor:
+        motion = Motion(group, solution, par)
+        U = U.copy()
+        for effect in motor:
+            j = effect.hypothesis.joint
+            U[..., j] += plane.record * motion.lines(
+                effect.hypothesis.law(effect.p, motion, j, par.stiffness[j])
+            )
+        solution = replace(solution, U=U)
+    for effect in by_channel.get("drive", []):
+        j = effect.hypothesis.joint
+        U = U.copy()
+        U[..., j] = effect.hypothesis.law(
+            effect.p, Motion(group, solution, par), j, par.stiffness[j], U[..., j]
+        )
+    return Prediction(structure, par, plane, solution, U)
+
+
+def _inner_torques(
+    structure: Structure,
+    par: Parameters,
+    plane: Plane,
+    group: Group,
+    solution: Solution,
+    effects: Sequence[Effect],
+) -> Torques:
+    """Spring and link torques of effects, solved together with the arm they act on.
+
+    A law on the gear's deflection is solved as a scalar loop through the compliance of the arm at
+    that gear, the torques of all others held.
+    """
+    S, L, n = solution.Q.shape
+    spring = np.zeros((S, L, n), complex)
+    link = np.zeros((S, L, structure.n_coordinates), complex)
+    spring += solution.torques.spring
+    link += solution.torques.link
+    motion = Motion(group, solution, par)
+    per_joint: dict[int, np.ndarray] = {}
+    for effect in effects:
+        h, j = effect.hypothesis, effect.hypothesis.joint
+        if h.channel == "link":
+            column = structure.driven[j]
+            per_joint[1000 + j] = per_joint.get(1000 + j, 0.0) + motion.lines(
+                h.law(effect.p, _link_view(motion, j, column), j, par.stiffness[j])
+            )
+        elif h.options.get("kinematic"):
+            X = motion.lines(h.law(effect.p, motion, j, par.stiffness[j]))
+            per_joint[j] = per_joint.get(j, 0.0) + plane.C[:, j] * X
+    for effect in effects:
+        h, j = effect.hypothesis, effect.hypothesis.joint
+        if h.channel == "spring" and not h.options.get("kinematic"):
+            compliance = plane.A_inv[:, structure.driven[j], structure.driven[j]]
+            linear = solution.delta[..., j] + compliance * (spring[..., j] - per_joint.get(j, 0.0))
+            H = _spring_loop(structure, par, plane, group, effect, linear)
+            per_joint[j] = per_joint.get(j, 0.0) + motion.lines(H)
+    for j, value in per_joint.items():
+        if j >= 1000:
+            link[..., structure.driven[j - 1000]] = value
+        else:
+            spring[..., j] = value
+    return Torques(spring=spring, link=link)
+
+
+def _spring_loop(
+    structure: Structure, par: Parameters, plane: Plane, group: Group, effect: Effect, linear: np.ndarray
+) -> np.ndarray:
+    j = effect.hypothesis.joint
+    code, a, b, k = effect.hypothesis.law(effect.p, None, par.stiffness[j])
+    D = np.diag(damping_diagonal(structure, par))
+    K = np.diag(stiffness_diagonal(structure, par)) + plane.lin.Kg
+    dt = group.period_time / group.n_time
+    modes = kernels.modal_compliance(plane.lin.M, D, K, int(structure.driven[j]), dt)
+    return kernels.spring_loop(code, a, b, k, group.to_time(linear[..., None])[..., 0], *modes)
+
+
+def _link_view(motion: Motion, joint: int, column: int) -> Motion:
+    """The motion with link coordinate ``joint`` moved to where laws look for it."""
+    if joint == column:
+        return motion
+    Q_a = motion.solution.Q_a.copy()
+    Q_a[..., joint] = motion.solution.Q_a[..., column]
+    return replace(motion, solution=replace(motion.solution, Q_a=Q_a))

@@ -1,0 +1,448 @@
+"""The gray-box model: a flexible-joint arm in Pinocchio, linearised where it was measured.
+
+With motor angles ``q_m`` (n) and link coordinates ``q_a`` (N >= n: the driven joints and every
+elastic hinge that no motor turns),
+
+    J q_m'' + f q_m' + T^T tau_s            = u
+    M(q_a) q_a'' + c(q_a, q_a') + g(q_a)    = S tau_s - E (K_e q_e + D_e q_e')
+    tau_s = K (T q_m - S^T q_a) + D (T q_m' - S^T q_a')
+
+(Moberg, Oehr and Gunnarsson 2014; Spong 1987 for N = n). ``T`` is the identity unless the gears
+couple joints. All drive figures are referred to the link side of the gear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from robot_assets.errors import DataError
+from robot_assets.robot import Elasticity, Robot
+
+_AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What parameters do not change: the chain, and which of its coordinates are driven.
+
+    Attributes:
+        model: Pinocchio model over the N link coordinates, loads included.
+        driven: (n,) index of each driven joint among the link coordinates.
+        elastic: (n_e,) indices of the elastic hinges.
+        bodies: link name -> (Pinocchio joint index, placement of the link frame in it).
+        robot: the robot it was built from.
+    """
+
+    model: pin.Model
+    driven: np.ndarray
+    elastic: np.ndarray
+    bodies: dict[str, tuple[int, pin.SE3]]
+    robot: Robot
+
+    @property
+    def n(self) -> int:
+        """Number of motors."""
+        return len(self.driven)
+
+    @property
+    def n_coordinates(self) -> int:
+        """Number of link coordinates N."""
+        return self.model.nv
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The baseline parameters, SI, link side of the gear.
+
+    Attributes:
+        stiffness: (n,) gear stiffness, N m/rad.
+        damping: (n,) damping in parallel with it, N m s/rad.
+        inertia: (n,) motor inertia, kg m2.
+        viscous: (n,) viscous friction of the motor, N m s/rad.
+        elastic_stiffness: (n_e,) stiffness of the elastic hinges, N m/rad.
+        elastic_damping: (n_e,) their damping, N m s/rad.
+        timing: common delay of the torque channel against the position channel that the sampling
+            model does not know of, s (a fraction of a sample).
+        coupling: (n, n) T of the module docstring.
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    inertia: np.ndarray
+    viscous: np.ndarray
+    elastic_stiffness: np.ndarray
+    elastic_damping: np.ndarray
+    timing: float
+    coupling: np.ndarray
+
+    @classmethod
+    def nominal(cls, robot: Robot) -> Parameters:
+        """The starting guesses of ``robot.toml``."""
+        return cls(
+            stiffness=robot.array("stiffness").copy(),
+            damping=robot.array("damping").copy(),
+            inertia=robot.array("motor_inertia").copy(),
+            viscous=robot.array("viscous_friction").copy(),
+            elastic_stiffness=np.array([e.stiffness for e in robot.elasticities], float),
+            elastic_damping=np.array([e.damping for e in robot.elasticities], float),
+            timing=0.0,
+            coupling=np.eye(robot.n),
+        )
+
+    def to_log(self) -> np.ndarray:
+        """(4 n + 2 n_e,) logarithms in the order stiffness, damping, inertia, viscous, elastic."""
+        return np.log(
+            np.concatenate(
+                [
+                    self.stiffness,
+                    self.damping,
+                    self.inertia,
+                    self.viscous,
+                    self.elastic_stiffness,
+                    self.elastic_damping,
+                ]
+            )
+        )
+
+    def with_log(self, x: np.ndarray) -> Parameters:
+        """A copy with the positive parameters taken from ``to_log`` order."""
+        n, e = len(self.stiffness), len(self.elastic_stiffness)
+        parts = np.split(np.exp(x), np.cumsum([n, n, n, n, e]))
+        return replace(
+            self,
+            stiffness=parts[0],
+            damping=parts[1],
+            inertia=parts[2],
+            viscous=parts[3],
+            elastic_stiffness=parts[4],
+            elastic_damping=parts[5],
+        )
+
+
+def parameter_names(robot: Robot) -> tuple[str, ...]:
+    """Names in the order of ``Parameters.to_log``: ``stiffness.<joint>`` and so on."""
+    kinds = ("stiffness", "damping", "motor_inertia", "viscous_friction")
+    names = [f"{kind}.{joint}" for kind in kinds for joint in robot.joint_names]
+    names += [f"{kind}.{e.name}" for kind in kinds[:2] for e in robot.elasticities]
+    return tuple(names)
+
+
+def parameter_unit(name: str) -> str:
+    """SI unit of a parameter named by ``parameter_names``."""
+    return {
+        "stiffness": "N m/rad",
+        "damping": "N m s/rad",
+        "motor_inertia": "kg m2",
+        "viscous_friction": "N m s/rad",
+    }[name.split(".")[0]]
+
+
+def build_structure(
+    robot: Robot,
+    *,
+    elasticities: tuple[Elasticity, ...] = (),
+    loads: tuple[tuple[str, pin.Inertia], ...] = (),
+    scale_links: dict[str, float] | None = None,
+) -> Structure:
+    """Pinocchio chain of a robot, with elastic hinges and loads placed.
+
+    Args:
+        robot: the arm.
+        elasticities: elastic hinges beyond those of the robot.
+        loads: (link name, inertia in that link's frame) beyond those of the robot.
+        scale_links: link name -> factor on its mass and inertia.
+
+    Raises:
+        DataError: where the URDF lacks a joint or link that the robot names, or holds a joint
+            that is neither driven nor locked.
+    """
+    source = _reduced_model(robot)
+    hinges = robot.elasticities + tuple(elasticities)
+    model = pin.Model()
+    model.name = robot.name
+    model.gravity.linear = np.asarray(robot.gravity, float)
+    carrier = {0: _add_hinges(model, 0, "base", hinges, pin.SE3.Identity())}
+    index: dict[str, int] = {}
+    for i in range(1, source.njoints):
+        name, joint = source.names[i], source.joints[i]
+        k = model.addJoint(
+            carrier[source.parents[i]], _joint_model(joint), source.jointPlacements[i], name
+        )
+        index[name] = model.idx_vs[k]
+        carrier[i] = _add_hinges(model, k, name, hinges, pin.SE3.Identity())
+        model.appendBodyToJoint(carrier[i], source.inertias[i], pin.SE3.Identity())
+    bodies = {
+        f.name: (carrier[f.parentJoint], f.placement)
+        for f in source.frames
+        if f.type == pin.FrameType.BODY
+    }
+    parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
+    for link, factor in (scale_links or {}).items():
+        own = source.inertias[parent[link]]
+        extra = pin.Inertia(own.mass * (factor - 1.0), own.lever, own.inertia * (factor - 1.0))
+        model.appendBodyToJoint(bodies[link][0], extra, pin.SE3.Identity())
+    known = [
+        (load.link, pin.Inertia(load.mass, np.asarray(load.com), np.asarray(load.inertia)))
+        for load in robot.loads
+    ]
+    for link, inertia in [*known, *loads]:
+        if link not in bodies:
+            raise DataError("load", str(robot.folder), link, f"a link among {sorted(bodies)}")
+        joint_index, placement = bodies[link]
+        model.appendBodyToJoint(joint_index, inertia, placement)
+    driven = np.array([index[name] for name in robot.joint_names])
+    elastic = np.array(
+        [model.idx_vs[model.getJointId(_hinge_name(h))] for h in hinges], dtype=int
+    )
+    return Structure(model, driven, elastic, bodies, robot)
+
+
+def equilibrium(structure: Structure, par: Parameters, q_m: np.ndarray) -> np.ndarray:
+    """Link coordinates at rest under gravity, motors held at ``q_m``; (N,) rad.
+
+    Newton on ``g(q_a) = S K (T q_m - S^T q_a) - E K_e q_e``; it depends on the parameters, as the
+    sag of the springs does (Wernholt and Moberg 2011, Sec. 2.1).
+    """
+    model, data = structure.model, structure.model.createData()
+    stiffness = stiffness_diagonal(structure, par)
+    rest = np.zeros(model.nv)
+    rest[structure.driven] = par.coupling @ q_m
+    q = rest.copy()
+    for _ in range(50):
+        g = pin.computeGeneralizedGravity(model, data, q)
+        slope = pin.computeGeneralizedGravityDerivatives(model, data, q)
+        step = np.linalg.solve(slope + np.diag(stiffness), stiffness * (rest - q) - g)
+        q = q + step
+        if np.max(np.abs(step)) < 1e-13:
+            break
+    return q
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Second-order matrices of the link side at one equilibrium.
+
+    Attributes:
+        q: (N,) link coordinates, rad.
+        M: (N, N) inertia matrix, kg m2.
+        Kg: (N, N) slope of the gravity torque, N m/rad.
+        g: (N,) gravity torque, N m.
+    """
+
+    q: np.ndarray
+    M: np.ndarray
+    Kg: np.ndarray
+    g: np.ndarray
+
+
+def linearise(structure: Structure, q: np.ndarray) -> Linearisation:
+    """Inertia, gravity and gravity slope of the link side at ``q`` (N,), at rest."""
+    model, data = structure.model, structure.model.createData()
+    M = pin.crba(model, data, q)
+    M = np.triu(M) + np.triu(M, 1).T
+    slope = np.array(pin.computeGeneralizedGravityDerivatives(model, data, q))
+    return Linearisation(q, M, slope, np.array(pin.computeGeneralizedGravity(model, data, q)))
+
+
+def stiffness_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
+    """(N,) spring stiffness of each link coordinate, N m/rad."""
+    out = np.zeros(structure.n_coordinates)
+    out[structure.driven] = par.stiffness
+    out[structure.elastic] = par.elastic_stiffness
+    return out
+
+
+def damping_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
+    """(N,) spring damping of each link coordinate, N m s/rad."""
+    out = np.zeros(structure.n_coordinates)
+    out[structure.driven] = par.damping
+    out[structure.elastic] = par.elastic_damping
+    return out
+
+
+def hold_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarray:
+    """Continuous torque per recorded sample torque: the zero-order hold; (F,) complex.
+
+    ``exp(-j w T / 2) sinc(w T / 2)`` for ``"zoh"``, 1 for ``"none"``.
+    """
+    if hold == "none":
+        return np.ones(len(omega), complex)
+    x = omega * sample_time / 2.0
+    return np.exp(-1j * x) * np.sinc(x / np.pi)
+
+
+def alias_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarray:
+    """Position that the images of a held torque add to a unit inertia in the band; (F,) s2.
+
+    The spectrum of a held torque has images about multiples of the sample rate. Far above its
+    resonances every motor is its bare inertia, so what the images add after sampling is that of a
+    double integrator: its exact sampled response ``T^2 (z + 1) / (2 (z - 1)^2)`` less its
+    baseband part. The error left is of the order of (resonance / sample rate)^2 of this term.
+    """
+    if hold == "none":
+        return np.zeros(len(omega), complex)
+    out = np.zeros(len(omega), complex)
+    w = omega[omega > 0]
+    z = np.exp(1j * w * sample_time)
+    exact = sample_time**2 * (z + 1) / (2 * (z - 1) ** 2)
+    out[omega > 0] = exact + hold_response(w, sample_time, hold) / w**2
+    return out
+
+
+def impedance(
+    structure: Structure, par: Parameters, lin: Linearisation, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Torque per motor position of the linearised arm.
+
+    Args:
+        s: (F,) complex frequencies, rad/s.
+
+    Returns:
+        Z: (F, n, n) N m/rad, ``s^2 J + s f + T^T (C - C S^T A^{-1} S C) T``.
+        A_inv: (F, N, N) inverse of ``s^2 M + s D + K + Kg``, the link side with motors held.
+        C: (F, n) spring ``K + s D``.
+    """
+    n, driven = structure.n, structure.driven
+    K = stiffness_diagonal(structure, par)
+    D = damping_diagonal(structure, par)
+    A = s[:, None, None] ** 2 * lin.M + lin.Kg
+    diag = np.arange(structure.n_coordinates)
+    A[:, diag, diag] += K + s[:, None] * D
+    A_inv = np.linalg.inv(A)
+    C = par.stiffness + s[:, None] * par.damping
+    Z = -C[:, :, None] * A_inv[:, driven[:, None], driven] * C[:, None, :]
+    k = np.arange(n)
+    Z[:, k, k] += C
+    Z = par.coupling.T @ Z @ par.coupling
+    Z[:, k, k] += s[:, None] ** 2 * par.inertia + s[:, None] * par.viscous
+    return Z, A_inv, C
+
+
+def sampled_frf(
+    structure: Structure,
+    par: Parameters,
+    lin: Linearisation,
+    frequency: np.ndarray,
+    sample_time: float,
+    hold: str,
+    *,
+    derivatives: bool = False,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """FRF from recorded motor torque to sampled motor acceleration ``(j w)^2 q``.
+
+    Args:
+        frequency: (F,) Hz, above zero and below Nyquist.
+        derivatives: also return the derivative by each entry of ``Parameters.to_log`` and, last,
+            by ``timing``.
+
+    Returns:
+        G: (F, n, n) (rad/s2)/(N m).
+        dG: (F, n, n, n_theta) or None.
+    """
+    omega = 2 * np.pi * np.asarray(frequency, float)
+    s = 1j * omega
+    Z, A_inv, C = impedance(structure, par, lin, s)
+    H0 = hold_response(omega, sample_time, hold) * np.exp(-s * par.timing)
+    alias = alias_response(omega, sample_time, hold)
+    Y = np.linalg.inv(Z)
+    k = np.arange(structure.n)
+    gain = (H0 * s**2)[:, None, None]
+    G = gain * Y
+    G[:, k, k] += (s**2 * alias)[:, None] / par.inertia
+    if not derivatives:
+        return G, None
+    dZ_left, dZ_right = impedance_derivatives(structure, par, s, A_inv, C)
+    dG = -gain[..., None] * np.einsum("fij,fjp,fpk,fkl->filp", Y, dZ_left, dZ_right, Y, optimize=True)
+    n = structure.n
+    for j in range(n):
+        dG[:, j, j, 2 * n + j] -= s**2 * alias / par.inertia[j]
+    d_timing = (-s)[:, None, None] * gain * Y
+    return G, np.concatenate([dG, d_timing[..., None]], axis=3)
+
+
+def impedance_derivatives(
+    structure: Structure, par: Parameters, s: np.ndarray, A_inv: np.ndarray, C: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative of the impedance by the log-parameters, each of rank one.
+
+    ``dZ/dtheta_p = left[:, :, p] right[:, p, :]`` (theory: a spring changes the stiffness matrix
+    by ``a a^T``, so every derivative of its inverse is an outer product).
+
+    Returns:
+        left: (F, n, n_theta), right: (F, n_theta, n).
+    """
+    n, driven, elastic = structure.n, structure.driven, structure.elastic
+    eye = np.broadcast_to(np.eye(n), (len(s), n, n))
+    # Deflection of each spring per motor position, and torque per pseudo-torque: transposes.
+    deflection = (eye - A_inv[:, driven[:, None], driven] * C[:, None, :]) @ par.coupling
+    hinge = (A_inv[:, elastic[:, None], driven] * C[:, None, :]) @ par.coupling
+    one = s[:, None, None] * np.ones((1, 1, 1))
+    right = np.concatenate(
+        [
+            par.stiffness[:, None] * deflection,
+            one * par.damping[:, None] * deflection,
+            one**2 * par.inertia[:, None] * eye,
+            one * par.viscous[:, None] * eye,
+            par.elastic_stiffness[:, None] * hinge,
+            one * par.elastic_damping[:, None] * hinge,
+        ],
+        axis=1,
+    )
+    plain = [deflection, deflection, eye, eye, hinge, hinge]
+    left = np.concatenate([np.swapaxes(x, 1, 2) for x in plain], axis=2)
+    return left, right
+
+
+def _reduced_model(robot: Robot) -> pin.Model:
+    try:
+        full = pin.buildModelFromUrdf(str(robot.urdf))
+    except Exception as err:
+        raise DataError("URDF", str(robot.urdf), str(err).splitlines()[0], "a readable URDF") from err
+    movable = set(full.names[1:])
+    missing = [name for name in robot.joint_names if name not in movable]
+    if missing:
+        raise DataError("joint", str(robot.urdf), f"no {missing[0]}", f"one of {sorted(movable)}")
+    free = movable - set(robot.joint_names)
+    stray = sorted(free - set(robot.locked))
+    if stray:
+        raise DataError(
+            "joint", str(robot.folder), f"{stray[0]} neither driven nor locked", "a [locked] entry"
+        )
+    q = pin.neutral(full)
+    for name in free:
+        joint = full.joints[full.getJointId(name)]
+        angle = float(robot.locked[name])
+        q[joint.idx_q : joint.idx_q + joint.nq] = (
+            [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
+        )
+    return pin.buildReducedModel(full, [full.getJointId(name) for name in free], q)
+
+
+def _joint_model(joint: pin.JointModel) -> pin.JointModel:
+    """The same axis as a joint of one coordinate (a URDF "continuous" joint has two)."""
+    kind = joint.shortname()
+    prismatic = "JointModelP" in kind
+    axis = np.asarray(
+        joint.extract().axis if "Unaligned" in kind else _AXES.get(kind[-1], (0.0, 0.0, 0.0)), float
+    )
+    if not np.any(axis):
+        raise DataError("joint", kind, "a joint of several degrees of freedom", "revolute or prismatic")
+    return pin.JointModelPrismaticUnaligned(axis) if prismatic else pin.JointModelRevoluteUnaligned(axis)
+
+
+def _hinge_name(hinge: Elasticity) -> str:
+    return f"elasticity:{hinge.name}"
+
+
+def _add_hinges(
+    model: pin.Model, parent: int, joint: str, hinges: tuple[Elasticity, ...], placement: pin.SE3
+) -> int:
+    for hinge in hinges:
+        if hinge.joint == joint:
+            axis = np.asarray(hinge.axis, float)
+            revolute = pin.JointModelRevoluteUnaligned(axis / np.linalg.norm(axis))
+            parent = model.addJoint(parent, revolute, placement, _hinge_name(hinge))
+    return parent

@@ -1,0 +1,81 @@
+"""The catalogue of effects as hypotheses that can be fitted."""
+
+from __future__ import annotations
+
+from ident.graybox import Structure
+from ident.hypotheses import drive, friction, sensing, structure, transmission
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
+
+PER_JOINT = (
+    friction.coulomb_friction,
+    friction.stribeck_friction,
+    friction.presliding_friction,
+    friction.load_dependent_friction,
+    friction.friction_drift,
+    drive.cogging,
+    drive.torque_constant,
+    drive.torque_lag,
+    drive.torque_delay,
+    drive.torque_saturation,
+    transmission.hardening_stiffness,
+    transmission.softening_stiffness,
+    transmission.backlash,
+    transmission.hysteresis,
+    transmission.transmission_error,
+    structure.gravity_spring,
+    structure.dress_pack,
+    sensing.encoder_eccentricity,
+    sensing.sensor_delay,
+    sensing.sensor_lag,
+)
+
+
+def catalogue(chain: Structure) -> tuple[Hypothesis, ...]:
+    """Every hypothesis at every place of an arm, decoys included.
+
+    Decoys describe what the catalogue lacks: one that explains the data better than every named
+    effect says that the cause is unknown.
+    """
+    robot = chain.robot
+    names = robot.joint_names
+    out: list[Hypothesis] = []
+    for j, name in enumerate(names):
+        out += [make(j, name) for make in PER_JOINT]
+        out += [friction.velocity_power(j, name, power) for power in (2, 3)]
+        out.append(friction.position_friction(j, name))
+    for j in range(len(names) - 1):
+        out.append(structure.joint_coupling(j, j + 1, names[j]))
+    if robot.payload_link in chain.bodies:
+        out.append(structure.payload(robot.payload_link))
+    seen: set[int] = set()
+    for link, (index, _) in chain.bodies.items():
+        if index in seen or index == 0:
+            continue
+        seen.add(index)
+        out.append(structure.link_inertia(link, _joint_of_body(chain, index)))
+    for j, name in enumerate(names):
+        out += [structure.compliance(name, j, axis, "transverse_elasticity") for axis in _across(chain, j)]
+    for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
+        out.append(structure.compliance("base", -1, axis, "base_elasticity"))
+    return tuple(out)
+
+
+def _joint_of_body(chain: Structure, index: int) -> int:
+    """Driven joint that carries a body, -1 where there is none."""
+    column = chain.model.idx_vs[index]
+    driven = list(chain.driven)
+    below = [j for j, c in enumerate(driven) if c <= column]
+    return below[-1] if below else -1
+
+
+def _across(chain: Structure, joint: int) -> list[tuple[float, float, float]]:
+    """Two axes of the joint's frame that are not its own."""
+    import numpy as np
+
+    index = next(i for i in range(1, chain.model.njoints) if chain.model.idx_vs[i] == chain.driven[joint])
+    own = np.asarray(chain.model.joints[index].extract().axis)
+    axes = sorted(np.eye(3), key=lambda a: abs(a @ own))[:2]
+    return [tuple(float(v) for v in a) for a in axes]
+
+
+__all__ = ["Hypothesis", "Parameter", "Screen", "SignalScale", "catalogue"]

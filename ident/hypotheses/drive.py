@@ -1,0 +1,162 @@
+"""Effects of the drive: between the torque that is recorded and the one that the motor delivers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.inverse import Motion
+
+
+def torque_constant(joint: int, place: str) -> Hypothesis:
+    """Delivered torque is ``scale`` times the recorded one."""
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        return Screen((motion.solution.U[..., j],), lambda c: np.array([1.0 / (1.0 + np.clip(c[0], -0.8, 4.0))]))
+
+    return Hypothesis(
+        "torque_constant",
+        place,
+        joint,
+        "drive",
+        (Parameter("scale", "1", 0.05, 20.0, log=True),),
+        lambda p, motion, j, k, U: U / p[0],
+        lambda scale: [()],
+        screen,
+        "The motor of {joint} delivers {scale:.4g} times the torque that is recorded, at every frequency and"
+        " in every posture.",
+        variable="torque",
+    )
+
+
+def torque_lag(joint: int, place: str) -> Hypothesis:
+    """Current loop as a first-order lag: ``delivered = recorded / (1 + s time_constant)``."""
+
+    def law(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
+        return U * (1.0 + 1j * motion.group.omega * p[0])
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        return Screen(
+            (1j * motion.group.omega * motion.solution.U[..., j],),
+            lambda c: np.array([c[0]]) if c[0] > 0 else None,
+        )
+
+    return Hypothesis(
+        "torque_lag",
+        place,
+        joint,
+        "drive",
+        (Parameter("time_constant", "s", 1e-7, 1.0, log=True),),
+        law,
+        lambda scale: [()],
+        screen,
+        "The torque of {joint} follows its record as a first-order lag of {time_constant:.3g} s: phase is lost"
+        " and gain falls with frequency.",
+        variable="torque",
+    )
+
+
+def torque_delay(joint: int, place: str) -> Hypothesis:
+    """The torque comes ``delay`` after its record."""
+
+    def law(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
+        return U * np.exp(1j * motion.group.omega * p[0])
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        return Screen(
+            (1j * motion.group.omega * motion.solution.U[..., j],),
+            lambda c: np.array([c[0]]) if c[0] > 0 else None,
+        )
+
+    return Hypothesis(
+        "torque_delay",
+        place,
+        joint,
+        "drive",
+        (Parameter("delay", "s", 1e-7, 1.0, log=True),),
+        law,
+        lambda scale: [()],
+        screen,
+        "The torque of {joint} acts {delay:.3g} s after its record: phase linear in frequency, gain untouched.",
+        variable="torque",
+    )
+
+
+def torque_saturation(joint: int, place: str) -> Hypothesis:
+    """Delivered torque is clipped at ``limit``."""
+
+    def excess(limit: float, motion: Motion, j: int) -> np.ndarray:
+        u = motion.torque(j)
+        return u - np.clip(u, -limit, limit)
+
+    return Hypothesis(
+        "torque_saturation",
+        place,
+        joint,
+        "drive",
+        (Parameter("limit", "N m", 1e-6, 1e8, log=True, step=1e-3),),
+        lambda p, motion, j, k, U: U + motion.lines(excess(p[0], motion, j)),
+        lambda scale: [(f * scale.peak_torque,) for f in (0.5, 0.65, 0.8, 0.9, 0.96)],
+        lambda motion, j, k, shape: Screen(
+            (excess(shape[0], motion, j),), lambda c: np.array([shape[0]]) if c[0] > 0.2 else None, shape
+        ),
+        "The motor of {joint} delivers no more than {limit:.4g} N m: the residual torque sits at the peaks.",
+        variable="torque",
+    )
+
+
+def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothesis:
+    """``amplitude sin(periods_per_rev q + phase)`` at the motor."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        q = motion.q(j)
+        return p[0] * np.sin(p[1] * q) + p[2] * np.cos(p[1] * q)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        q = motion.q(j)
+        return Screen(
+            (np.sin(shape[0] * q), np.cos(shape[0] * q)), lambda c: np.array([c[0], shape[0], c[1]]), shape
+        )
+
+    return Hypothesis(
+        "cogging",
+        place,
+        joint,
+        "motor",
+        (
+            Parameter("sine", "N m", -1e7, 1e7),
+            Parameter("periods_per_rev", "1", 0.3, 1e5, step=1e-3),
+            Parameter("cosine", "N m", -1e7, 1e7),
+        ),
+        law,
+        lambda scale: [(n,) for n in scale.wave_numbers],
+        screen,
+        "The residual torque of {joint} is periodic in its motor angle: {amplitude:.3g} N m,"
+        " {periods_per_rev:.4g} periods a turn of the joint.",
+        variable="q",
+    )
+
+
+def time_ripple(joint: int, place: str, frequency: float) -> Hypothesis:
+    """Decoy: a torque periodic in time at a frequency of its own, whatever the arm does."""
+
+    def unit(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+        x = 2 * np.pi * frequency * motion.time
+        return np.sin(x), np.cos(x)
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        sine, cosine = unit(motion)
+        return p[0] * sine + p[1] * cosine
+
+    return Hypothesis(
+        "unknown:time_ripple",
+        place,
+        joint,
+        "motor",
+        (Parameter("sine", "N m", -1e7, 1e7), Parameter("cosine", "N m", -1e7, 1e7)),
+        law,
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen(unit(motion), lambda c: np.array(c)),
+        "The residual torque of {joint} is periodic in time.",
+        variable="time",
+    )

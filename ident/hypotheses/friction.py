@@ -1,0 +1,227 @@
+"""Friction of the motor side: torque against motor motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
+from ident.hypotheses.kernels import bristle
+from ident.inverse import Motion
+
+SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
+
+
+def direction(v: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
+    """Sign of a velocity (S, T), averaged over each step of the grid.
+
+    Within a step the velocity is taken as linear, so that a reversal between two samples enters
+    with its own time: a plain sign would add broadband noise of the size of the step. A smoothing
+    velocity widens the reversal as regularised and presliding friction do.
+    """
+    slope = 0.25 * np.abs(np.roll(v, -1, axis=-1) - np.roll(v, 1, axis=-1))
+    x = v / np.maximum(slope, 1e-300)
+    return np.clip(x, -1.0, 1.0) if smoothing <= 0 else np.tanh(v / np.hypot(slope * 0.6, smoothing))
+
+
+def coulomb_friction(joint: int, place: str) -> Hypothesis:
+    """``torque (sign v + asymmetry)`` (effects.md)."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        s = direction(motion.v(j), p[2])
+        return p[0] * (s + p[1] * np.abs(s))
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        s = direction(motion.v(j), shape[0])
+        return Screen(
+            (s, np.abs(s)),
+            lambda c: np.array([c[0], np.clip(c[1] / c[0], -0.8, 0.8), shape[0]]) if c[0] > 0 else None,
+            shape,
+        )
+
+    return Hypothesis(
+        "coulomb_friction",
+        place,
+        joint,
+        "motor",
+        (
+            Parameter("torque", "N m", 1e-9, 1e7, log=True),
+            Parameter("asymmetry", "1", -0.95, 0.95),
+            SMOOTHING,
+        ),
+        law,
+        lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
+        screen,
+        "The residual torque of {joint} is a step in its velocity: a friction torque of {torque:.3g} N m"
+        " against the motion whatever its speed.",
+    )
+
+
+def stribeck_friction(joint: int, place: str) -> Hypothesis:
+    """``sign v (coulomb + (static - coulomb) exp(-(v / v_s)^2))`` (Armstrong-Helouvry 1991)."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        v = motion.v(j)
+        return direction(v, p[3]) * (p[0] + (p[1] - p[0]) * np.exp(-((v / p[2]) ** 2)))
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        v = motion.v(j)
+        s = direction(v, shape[0] * 0.02)
+
+        def start(c):
+            if c[0] <= 0 or c[1] <= 0:
+                return None
+            return np.array([c[0], c[0] + c[1], shape[0], shape[0] * 0.02])
+
+        return Screen((s, s * np.exp(-((v / shape[0]) ** 2))), start, shape)
+
+    return Hypothesis(
+        "stribeck_friction",
+        place,
+        joint,
+        "motor",
+        (
+            Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
+            Parameter("static", "N m", 1e-9, 1e7, log=True),
+            Parameter("stribeck_velocity", "rad/s", 1e-6, 1e2, log=True, step=1e-2),
+            SMOOTHING,
+        ),
+        law,
+        lambda scale: [(f * scale.v,) for f in (0.05, 0.15, 0.4, 1.0)],
+        screen,
+        "The residual torque of {joint} falls from {static:.3g} N m at rest to {coulomb:.3g} N m above"
+        " {stribeck_velocity:.2g} rad/s: friction with a Stribeck dip.",
+    )
+
+
+def presliding_friction(joint: int, place: str) -> Hypothesis:
+    """Dahl bristle: spring of ``stiffness`` before it slips at ``coulomb`` (Dahl 1968)."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        return p[1] * bristle(motion.v(j), motion.time_step, p[1] / p[0])
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        z = bristle(motion.v(j), motion.time_step, shape[0])
+        return Screen((z,), lambda c: np.array([c[0] / shape[0], c[0]]) if c[0] > 0 else None, shape)
+
+    return Hypothesis(
+        "presliding_friction",
+        place,
+        joint,
+        "motor",
+        (
+            Parameter("stiffness", "N m/rad", 1e-6, 1e12, log=True, step=1e-2),
+            Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
+        ),
+        law,
+        lambda scale: [(f * scale.q,) for f in (0.01, 0.03, 0.1, 0.3, 1.0)],
+        screen,
+        "The residual torque of {joint} makes loops in position: friction that yields as a spring of"
+        " {stiffness:.3g} N m/rad before it slips at {coulomb:.3g} N m.",
+        variable="q",
+    )
+
+
+def load_dependent_friction(joint: int, place: str) -> Hypothesis:
+    """``coefficient |tau_s| sign v`` (Bittencourt and Gunnarsson 2012)."""
+
+    def unit(motion: Motion, j: int, smoothing: float) -> np.ndarray:
+        return np.abs(motion.tau_s(j)) * direction(motion.v(j), smoothing)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        return Screen(
+            (unit(motion, j, shape[0]),), lambda c: np.array([c[0], shape[0]]) if c[0] > 0 else None, shape
+        )
+
+    return Hypothesis(
+        "load_dependent_friction",
+        place,
+        joint,
+        "motor",
+        (Parameter("coefficient", "1", 1e-9, 2.0, log=True), SMOOTHING),
+        lambda p, motion, j, k: p[0] * unit(motion, j, p[1]),
+        lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
+        screen,
+        "The friction torque of {joint} is {coefficient:.3g} of the torque it transmits: it differs"
+        " between postures as the load does.",
+    )
+
+
+def friction_drift(joint: int, place: str) -> Hypothesis:
+    """Friction that falls by ``relative_change`` with ``time_constant`` as the joint warms up."""
+
+    def unit(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        v = motion.v(j)
+        warm = 1.0 - np.exp(-motion.time / tau)
+        return v, direction(v), warm
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        v, s, warm = unit(motion, j, p[1])
+        return (p[2] * s) * (1.0 - p[0] * warm) - p[3] * p[0] * warm * v
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        v, s, warm = unit(motion, j, shape[0])
+
+        def start(c):
+            viscous = max(abs(c[0]), 1e-6) / 0.3
+            return np.array([0.3 if c[0] < 0 else -0.3, shape[0], max(c[1], 1e-6), viscous])
+
+        return Screen((warm * v, s, warm * s), start, shape)
+
+    return Hypothesis(
+        "friction_drift",
+        place,
+        joint,
+        "motor",
+        (
+            Parameter("relative_change", "1", -0.95, 0.95),
+            Parameter("time_constant", "s", 1.0, 1e5, log=True, step=1e-2),
+            Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True),
+            Parameter("viscous", "N m s/rad", 1e-9, 1e7, log=True, nuisance=True),
+        ),
+        law,
+        lambda scale: [(f * scale.duration,) for f in (0.1, 0.3, 1.0)] if scale.duration > 0 else [],
+        screen,
+        "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
+        " of {time_constant:.0f} s.",
+        variable="time",
+    )
+
+
+def velocity_power(joint: int, place: str, power: int) -> Hypothesis:
+    """Decoy: drag that grows with a power of the velocity, which the catalogue lacks."""
+
+    def unit(motion: Motion, j: int) -> np.ndarray:
+        v = motion.v(j)
+        return np.sign(v) * np.abs(v) ** power
+
+    return Hypothesis(
+        f"unknown:drag_{power}",
+        place,
+        joint,
+        "motor",
+        (Parameter("coefficient", "SI", -1e9, 1e9),),
+        lambda p, motion, j, k: p[0] * unit(motion, j),
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen((unit(motion, j),), lambda c: np.array([c[0]]), ()),
+        "The residual torque of {joint} grows with a power of its velocity.",
+    )
+
+
+def position_friction(joint: int, place: str) -> Hypothesis:
+    """Decoy: friction that depends on direction and position."""
+
+    def unit(motion: Motion, j: int) -> np.ndarray:
+        q = motion.q(j)
+        return direction(motion.v(j)) * (q - q.mean(axis=1, keepdims=True))
+
+    return Hypothesis(
+        "unknown:position_friction",
+        place,
+        joint,
+        "motor",
+        (Parameter("coefficient", "N m/rad", -1e9, 1e9),),
+        lambda p, motion, j, k: p[0] * unit(motion, j),
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen((unit(motion, j),), lambda c: np.array([c[0]]), ()),
+        "The residual torque of {joint} changes sign with direction and grows with position.",
+    )

@@ -1,0 +1,117 @@
+"""What a hypothesis is: one effect at one place, with parameters, a law and a screening form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ident.inverse import Motion
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect.
+
+    Attributes:
+        name, unit: as in the catalogue.
+        lower, upper: physical bounds.
+        log: fitted as a logarithm (positive parameters that span decades).
+        nuisance: fitted but not reported.
+        step: finite-difference step in fitted coordinates.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    log: bool = False
+    nuisance: bool = False
+    step: float = 1e-4
+
+    def to_internal(self, value: float) -> float:
+        value = float(np.clip(value, self.lower, self.upper))
+        return float(np.log(value)) if self.log else value
+
+    def to_external(self, x: float) -> float:
+        value = float(np.exp(np.clip(x, -700, 700))) if self.log else x
+        return float(np.clip(value, self.lower, self.upper))
+
+
+@dataclass(frozen=True)
+class Screen:
+    """Unit responses of a hypothesis at one value of its shape parameters.
+
+    Attributes:
+        signals: (S, T) torque signals whose weights are sought, or spectra (S, L) where complex.
+        start: weights -> parameter vector to start a refit from, or None where the weights are
+            not physical.
+        shape: value of the shape parameters, for keeping the best across operating points.
+    """
+
+    signals: tuple[np.ndarray, ...]
+    start: Callable[[np.ndarray], np.ndarray | None]
+    shape: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect of the catalogue (or a decoy outside it) at one place.
+
+    Attributes:
+        effect: catalogue name; decoys start with "unknown:".
+        place: joint, link, "flange" or "base".
+        joint: index of the driven joint, -1 where there is none.
+        channel: what the law returns and where it acts:
+            "motor" (S, T) torque at the motor; "spring" (S, T) torque in parallel with the gear;
+            "link" (S, T) torque on the link coordinate; "position" (S, L) spectrum to add to the
+            motor position; "drive" (S, L) recorded torque spectrum from the predicted one;
+            "model": the chain itself is changed (see structure.py).
+        parameters: in the order of the vector ``p`` of the law.
+        law: (p, motion, joint, stiffness) -> array as the channel says.
+        screen: motion, joint, stiffness, scale -> unit responses.
+        sentence: evidence with {joint} and the parameters as fields.
+    """
+
+    effect: str
+    place: str
+    joint: int
+    channel: str
+    parameters: tuple[Parameter, ...]
+    law: Callable[..., np.ndarray] | None
+    shapes: Callable[[SignalScale], list[tuple[float, ...]]]
+    screen: Callable[[Motion, int, float, tuple[float, ...]], Screen] | None
+    sentence: str
+    variable: str = "v"
+    options: dict = field(default_factory=dict)
+
+    @property
+    def decoy(self) -> bool:
+        return self.effect.startswith("unknown:")
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.effect, self.place
+
+
+@dataclass(frozen=True)
+class SignalScale:
+    """Sizes of the signals of a joint over all records, for shape grids.
+
+    Attributes:
+        v: rms velocity, rad/s; q: rms excursion, rad; delta: quantiles of |deflection| at
+        10, 50, 90, 99.5 %; torque: rms dynamic torque, N m; residual: rms residual torque, N m;
+        stiffness: N m/rad; wave_numbers: candidate periodicities in motor angle, 1/rad.
+    """
+
+    v: float
+    q: float
+    delta: np.ndarray
+    torque: float
+    residual: float
+    stiffness: float
+    peak_torque: float
+    duration: float
+    resonances: tuple[float, ...]
+    wave_numbers: tuple[float, ...]

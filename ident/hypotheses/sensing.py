@@ -1,0 +1,85 @@
+"""Effects of the position channel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.inverse import Motion
+
+
+def sensor_delay(joint: int, place: str) -> Hypothesis:
+    """Measured position comes ``delay`` late: the true one is ``exp(s delay)`` times it."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        return np.expm1(1j * motion.group.omega * p[0]) * motion.solution.Q[..., j]
+
+    return Hypothesis(
+        "sensor_delay",
+        place,
+        joint,
+        "position",
+        (Parameter("delay", "s", 1e-7, 1.0, log=True),),
+        law,
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen(
+            (1j * motion.group.omega * motion.solution.Q[..., j],),
+            lambda c: np.array([c[0]]) if c[0] > 0 else None,
+        ),
+        "The position of {joint} comes {delay:.3g} s late: the phase of one row, linear in frequency, also where"
+        " other joints drive it.",
+        variable="v",
+    )
+
+
+def sensor_lag(joint: int, place: str) -> Hypothesis:
+    """Measured position is filtered: the true one is ``(1 + s time_constant)`` times it."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        return 1j * motion.group.omega * p[0] * motion.solution.Q[..., j]
+
+    return Hypothesis(
+        "sensor_lag",
+        place,
+        joint,
+        "position",
+        (Parameter("time_constant", "s", 1e-7, 1.0, log=True),),
+        law,
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen(
+            (1j * motion.group.omega * motion.solution.Q[..., j],),
+            lambda c: np.array([c[0]]) if c[0] > 0 else None,
+        ),
+        "The position of {joint} passes a filter of {time_constant:.3g} s: phase and gain of one row of the FRF"
+        " fall with frequency.",
+        variable="v",
+    )
+
+
+def encoder_eccentricity(joint: int, place: str) -> Hypothesis:
+    """Measured position holds ``amplitude sin(q + phase)``; the true one is that much less."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        q = motion.q(j)
+        error = p[0] * np.sin(q) + p[1] * np.cos(q)
+        return -motion.lines(error - error.mean(axis=1, keepdims=True))
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        q = motion.q(j)
+        units = []
+        for unit in (np.sin(q), np.cos(q)):
+            units.append(-motion.lines(unit - unit.mean(axis=1, keepdims=True)))
+        return Screen(tuple(units), lambda c: np.array(c))
+
+    return Hypothesis(
+        "encoder_eccentricity",
+        place,
+        joint,
+        "position",
+        (Parameter("sine", "rad", -0.2, 0.2, step=1e-6), Parameter("cosine", "rad", -0.2, 0.2, step=1e-6)),
+        law,
+        lambda scale: [()],
+        screen,
+        "The encoder of {joint} errs by {amplitude:.3g} rad once a turn.",
+        variable="q",
+    )

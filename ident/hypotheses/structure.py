@@ -1,0 +1,326 @@
+"""Effects of the chain: loads, springs to the link side, compliance and coupling.
+
+Those on channel "model" change the gray-box itself; ``Change`` says how.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from ident.graybox import (
+    Parameters,
+    Structure,
+    build_structure,
+    impedance,
+    linearise,
+    equilibrium,
+)
+from ident.hypotheses.friction import direction
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.inverse import (
+    Motion,
+    Plane,
+    Solution,
+    coarse_group,
+    inverse_dynamics,
+    plane_at,
+    solve,
+)
+from ident.records import Group
+from robot_assets.robot import Elasticity
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of the chain: what ``build_structure`` and ``Parameters`` take."""
+
+    elasticities: tuple[Elasticity, ...] = ()
+    loads: tuple[tuple[str, pin.Inertia], ...] = ()
+    scale_links: tuple[tuple[str, float], ...] = ()
+    coupling: tuple[tuple[int, int, float], ...] = ()
+
+    def __add__(self, other: Change) -> Change:
+        return Change(
+            self.elasticities + other.elasticities,
+            self.loads + other.loads,
+            self.scale_links + other.scale_links,
+            self.coupling + other.coupling,
+        )
+
+
+def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple[Structure, Parameters]:
+    """The chain and parameters with a change made."""
+    if change == Change():
+        return structure, par
+    if change.elasticities or change.loads or change.scale_links:
+        structure = build_structure(
+            structure.robot,
+            elasticities=change.elasticities,
+            loads=change.loads,
+            scale_links=dict(change.scale_links),
+        )
+    coupling = par.coupling.copy()
+    for row, column, ratio in change.coupling:
+        coupling[row, column] += ratio
+    stiffness = [e.stiffness for e in change.elasticities]
+    damping = [e.damping for e in change.elasticities]
+    par = replace(
+        par,
+        coupling=coupling,
+        elastic_stiffness=np.concatenate([par.elastic_stiffness, stiffness]),
+        elastic_damping=np.concatenate([par.elastic_damping, damping]),
+    )
+    return structure, par
+
+
+def gravity_spring(joint: int, place: str) -> Hypothesis:
+    """Balancing spring on the link: ``stiffness (q_link - rest_angle)`` against it."""
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        q = motion.q_link(j)
+        return Screen(
+            (q, np.ones_like(q)),
+            lambda c: np.array([c[0], np.clip(-c[1] / c[0], -9.0, 9.0)]) if c[0] > 0 else None,
+        )
+
+    return Hypothesis(
+        "gravity_spring",
+        place,
+        joint,
+        "link",
+        (Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True), Parameter("rest_angle", "rad", -10.0, 10.0, step=1e-3)),
+        lambda p, motion, j, k: p[0] * (motion.q_link(j) - p[1]),
+        lambda scale: [()],
+        screen,
+        "A spring of {stiffness:.3g} N m/rad with rest at {rest_angle:.3g} rad pulls on the link of {joint}: static"
+        " torque that is linear in posture.",
+        variable="q",
+    )
+
+
+def dress_pack(joint: int, place: str) -> Hypothesis:
+    """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``."""
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        def start(c):
+            return np.array([max(c[0], 1e-3), c[1]]) if c[1] > 0 else None
+
+        return Screen((motion.q_link(j), direction(motion.v_link(j))), start)
+
+    return Hypothesis(
+        "dress_pack",
+        place,
+        joint,
+        "link",
+        (
+            Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True, step=1e-3),
+            Parameter("friction", "N m", 1e-9, 1e7, log=True, step=1e-3),
+        ),
+        lambda p, motion, j, k: p[0] * motion.q_link(j) + p[1] * direction(motion.v_link(j)),
+        lambda scale: [()],
+        screen,
+        "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
+        variable="q",
+    )
+
+
+def payload(link: str) -> Hypothesis:
+    """Unknown point load at ``com`` in the frame of the flange's link."""
+
+    def change(p) -> Change:
+        return Change(loads=((link, pin.Inertia(float(p[0]), np.asarray(p[1:4], float), np.zeros((3, 3)))),))
+
+    def responses(structure, par, plane, group, solution, shape):
+        joint, placement = structure.bodies[link]
+        units = []
+        for column in np.eye(4):
+            units.append(_inertial_response(structure, joint, placement, column, plane, group, solution))
+        return units
+
+    def start(c):
+        if c[0] <= 0:
+            return None
+        return np.concatenate([[c[0]], np.clip(c[1:] / c[0], -0.4, 0.4)])
+
+    return Hypothesis(
+        "payload",
+        "flange",
+        -1,
+        "model",
+        (
+            Parameter("mass", "kg", 1e-6, 1e4, log=True, step=1e-3),
+            Parameter("com_x", "m", -2.0, 2.0, step=1e-3),
+            Parameter("com_y", "m", -2.0, 2.0, step=1e-3),
+            Parameter("com_z", "m", -2.0, 2.0, step=1e-3),
+        ),
+        None,
+        lambda scale: [()],
+        None,
+        "An unknown load of {mass:.3g} kg hangs at the flange: anti-resonances fall at every posture and the gravity"
+        " torque changes with them.",
+        variable="posture",
+        options={"change": change, "responses": responses, "start": start},
+    )
+
+
+def link_inertia(link: str, joint_index: int) -> Hypothesis:
+    """Mass and inertia of a link are a multiple of those of the model."""
+
+    def change(p) -> Change:
+        return Change(scale_links=((link, float(p[0])),))
+
+    def responses(structure, par, plane, group, solution, shape):
+        joint, _ = structure.bodies[link]
+        own = build_structure(structure.robot, scale_links={link: 2.0}).model.inertias[joint]
+        base = build_structure(structure.robot).model.inertias[joint]
+        column = own.toDynamicParameters() - base.toDynamicParameters()
+        return [_inertial_response(structure, joint, pin.SE3.Identity(), column, plane, group, solution)]
+
+    return Hypothesis(
+        "link_inertia",
+        link,
+        joint_index,
+        "model",
+        (Parameter("scale", "1", 0.05, 20.0, log=True, step=1e-4),),
+        None,
+        lambda scale: [()],
+        None,
+        "The mass and inertia of {joint} are {scale:.4g} times those of the model.",
+        variable="posture",
+        options={
+            "change": change,
+            "responses": responses,
+            "start": lambda c: np.array([np.clip(1.0 + c[0], 0.2, 5.0)]),
+        },
+    )
+
+
+def joint_coupling(source: int, target: int, place: str) -> Hypothesis:
+    """Turning motor ``source`` turns joint ``target`` too, by ``ratio``."""
+
+    def responses(structure, par, plane, group, solution, shape):
+        step = 1e-4
+        coupling = par.coupling.copy()
+        coupling[target, source] += step
+        turned = replace(par, coupling=coupling)
+        wide = plane_at(structure, turned, plane.lin, group, plane.record)
+        moved = solve(structure, turned, wide, group, None, Q=solution.Q, W=solution.W)
+        still = solve(structure, par, plane, group, None, Q=solution.Q, W=solution.W)
+        return [(moved.U - still.U) / step]
+
+    return Hypothesis(
+        "joint_coupling",
+        place,
+        source,
+        "model",
+        (Parameter("ratio", "1", -2.0, 2.0, step=1e-4),),
+        None,
+        lambda scale: [()],
+        None,
+        "Turning the motor of {joint} turns the next joint too, by a ratio of {ratio:.4g}.",
+        variable="q",
+        options={
+            "change": lambda p: Change(coupling=((target, source, float(p[0])),)),
+            "responses": responses,
+            "start": lambda c: np.array([np.clip(c[0], -1.5, 1.5)]),
+        },
+    )
+
+
+def compliance(place: str, joint_index: int, axis: tuple[float, float, float], effect: str) -> Hypothesis:
+    """A spring-damper hinge across a joint (or under the base) that the model lacks."""
+    name = f"{effect}:{place}"
+
+    def hinge(stiffness: float, damping: float) -> Elasticity:
+        return Elasticity(name, place, axis, float(stiffness), float(damping))
+
+    def responses(structure, par, plane, group, solution, shape):
+        frequency, ratio = shape
+        own = hinge_inertia(structure, hinge(1e12, 1.0), group, plane)
+        stiffness = own * (2 * np.pi * frequency) ** 2
+        damping = 2 * ratio * np.sqrt(own * stiffness)
+        wide, wide_par = apply_change(structure, par, Change(elasticities=(hinge(stiffness, damping),)))
+        lin = linearise(wide, equilibrium(wide, wide_par, group.posture))
+        Z, _, _ = impedance(wide, wide_par, lin, plane.s)
+        unit = np.matmul(Z - plane.Z, solution.Q[..., None])[..., 0]
+        unit[:, 0] = 0.0
+        return [plane.record[:, None] * unit]
+
+    return Hypothesis(
+        effect,
+        place,
+        joint_index,
+        "model",
+        (
+            Parameter("stiffness", "N m/rad", 1.0, 1e12, log=True, step=1e-3),
+            Parameter("damping", "N m s/rad", 1e-6, 1e9, log=True, step=1e-2),
+        ),
+        None,
+        lambda scale: [(f, 0.03) for f in scale.resonances],
+        None,
+        "The data hold a resonance that the model lacks: {joint} bends across its axis with {stiffness:.3g} N m/rad."
+        if effect == "transverse_elasticity"
+        else "A resonance common to all axes: the foundation moves on {stiffness:.3g} N m/rad.",
+        variable="frequency",
+        options={
+            "change": lambda p: Change(elasticities=(hinge(p[0], p[1]),)),
+            "responses": responses,
+            "hinge": hinge,
+            "axis": axis,
+        },
+    )
+
+
+def hinge_inertia(structure: Structure, hinge: Elasticity, group: Group, plane: Plane) -> float:
+    """Inertia about a new hinge with everything else held, kg m2."""
+    wide = build_structure(structure.robot, elasticities=(hinge,))
+    q = np.zeros(wide.n_coordinates)
+    q[wide.driven] = group.posture
+    return float(linearise(wide, q).M[wide.elastic[-1], wide.elastic[-1]])
+
+
+def _inertial_response(
+    structure: Structure,
+    joint: int,
+    placement: pin.SE3,
+    column: np.ndarray,
+    plane: Plane,
+    group: Group,
+    solution: Solution,
+) -> np.ndarray:
+    """Recorded torque per unit of inertial parameters added to a body; (S, L, n).
+
+    ``column`` holds (up to ten) dynamic parameters [m, m c, I] in the link frame; inverse dynamics
+    is linear in them, so that the response is a difference of two inverse dynamics.
+    """
+    full = np.zeros(10)
+    full[: len(column)] = column
+    added = _move(full, placement)
+    model = structure.model.copy()
+    model.inertias[joint] = pin.Inertia.FromDynamicParameters(
+        model.inertias[joint].toDynamicParameters() + added
+    )
+    coarse = coarse_group(group)
+    s = plane.s[:, None]
+    motion = [coarse.to_time(s**k * solution.Q_a) for k in range(3)]
+    torque = inverse_dynamics(replace(structure, model=model), *motion) - inverse_dynamics(structure, *motion)
+    lines = coarse.to_lines(torque)
+    return plane.record[:, None] * np.matmul(plane.link_gain, lines[..., None])[..., 0]
+
+
+def _move(parameters: np.ndarray, placement: pin.SE3) -> np.ndarray:
+    """Dynamic parameters (10,) of a body given in a frame at ``placement`` of its joint.
+
+    Works for parameters that are no body by themselves (a first moment without mass).
+    """
+    if np.allclose(placement.homogeneous, np.eye(4)):
+        return parameters
+    big = pin.Inertia(1e3, np.zeros(3), 1e3 * np.eye(3)).toDynamicParameters()
+
+    def moved(x: np.ndarray) -> np.ndarray:
+        return placement.act(pin.Inertia.FromDynamicParameters(x)).toDynamicParameters()
+
+    return moved(big + parameters) - moved(big)

@@ -1,0 +1,156 @@
+"""Effects of the gear: torque against its deflection, and its kinematic error."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.hypotheses import kernels
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.inverse import Motion
+
+
+def _static(code: int, a: float, b: float, k: float, x: np.ndarray) -> np.ndarray:
+    if code == kernels.CUBIC:
+        return a * x**3
+    if code == kernels.BACKLASH:
+        return -k * np.clip(x, -0.5 * a, 0.5 * a)
+    if code == kernels.SOFTENING:
+        return (a - k) * np.clip(x, -b, b)
+    return kernels.elastoplastic(x, a, b)
+
+
+def hardening_stiffness(joint: int, place: str) -> Hypothesis:
+    """Gear torque ``K delta + cubic delta^3``."""
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        return Screen((motion.delta(j) ** 3,), lambda c: np.array([c[0]]) if c[0] > 0 else None)
+
+    return Hypothesis(
+        "hardening_stiffness",
+        place,
+        joint,
+        "spring",
+        (Parameter("cubic", "N m/rad3", 1e-3, 1e20, log=True, step=1e-2),),
+        lambda p, delta, k: (kernels.CUBIC, p[0], 0.0, k),
+        lambda scale: [()],
+        screen,
+        "The gear of {joint} stiffens with its deflection (cubic term {cubic:.3g} N m/rad3): the resonance"
+        " climbs with amplitude and with gravity load.",
+        variable="delta",
+    )
+
+
+def backlash(joint: int, place: str) -> Hypothesis:
+    """Dead band of width ``gap`` in the gear's deflection."""
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        signal = _static(kernels.BACKLASH, shape[0], 0.0, k, motion.delta(j))
+        return Screen(
+            (signal,), lambda c: np.array([shape[0] * np.clip(c[0], 0.3, 3.0)]) if c[0] > 0.1 else None, shape
+        )
+
+    return Hypothesis(
+        "backlash",
+        place,
+        joint,
+        "spring",
+        (Parameter("gap", "rad", 1e-9, 0.5, log=True, step=1e-2),),
+        lambda p, delta, k: (kernels.BACKLASH, p[0], 0.0, k),
+        lambda scale: [(2 * f * scale.delta[2],) for f in (0.03, 0.1, 0.3, 1.0)],
+        screen,
+        "The gear of {joint} has a dead band of {gap:.3g} rad: its resonance drops at small amplitude wherever"
+        " gravity does not preload it.",
+        variable="delta",
+    )
+
+
+def softening_stiffness(joint: int, place: str) -> Hypothesis:
+    """Stiffness ``low_stiffness`` within ``transition`` of zero deflection, K beyond."""
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        signal = -np.clip(motion.delta(j), -shape[0], shape[0])
+
+        def start(c):
+            return np.array([max(k - c[0], 0.05 * k), shape[0]]) if c[0] > 0 else None
+
+        return Screen((signal,), start, shape)
+
+    return Hypothesis(
+        "softening_stiffness",
+        place,
+        joint,
+        "spring",
+        (
+            Parameter("low_stiffness", "N m/rad", 1e-3, 1e12, log=True, step=1e-2),
+            Parameter("transition", "rad", 1e-9, 1.0, log=True, step=1e-2),
+        ),
+        lambda p, delta, k: (kernels.SOFTENING, min(p[0], k), p[1], k),
+        lambda scale: [(f * scale.delta[2],) for f in (0.1, 0.3, 0.7, 1.5)],
+        screen,
+        "The gear of {joint} is soft about zero torque ({low_stiffness:.3g} N m/rad within"
+        " {transition:.3g} rad): its resonance falls where it carries little.",
+        variable="delta",
+    )
+
+
+def hysteresis(joint: int, place: str) -> Hypothesis:
+    """Elastoplastic element beside the gear's spring (Maxwell slip)."""
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        unit = kernels.elastoplastic(motion.delta(j), 1.0, shape[0])
+        return Screen(
+            (unit,), lambda c: np.array([c[0], c[0] * shape[0]]) if c[0] > 0 else None, shape
+        )
+
+    return Hypothesis(
+        "hysteresis",
+        place,
+        joint,
+        "spring",
+        (
+            Parameter("stiffness", "N m/rad", 1e-3, 1e12, log=True, step=1e-2),
+            Parameter("yield_torque", "N m", 1e-9, 1e7, log=True, step=1e-2),
+        ),
+        lambda p, delta, k: (kernels.HYSTERESIS, p[0], p[1], k),
+        lambda scale: [(f * scale.delta[1],) for f in (0.03, 0.1, 0.3, 1.0)],
+        screen,
+        "The torque of {joint} makes loops against the gear's deflection: an element of {stiffness:.3g} N m/rad"
+        " that yields at {yield_torque:.3g} N m.",
+        variable="delta",
+    )
+
+
+def transmission_error(joint: int, place: str) -> Hypothesis:
+    """Gear sees ``q + amplitude sin(periods_per_rev q + phase)`` of the motor."""
+
+    def error(sine: float, n: float, cosine: float, motion: Motion, j: int) -> np.ndarray:
+        q = motion.q(j)
+        return sine * np.sin(n * q) + cosine * np.cos(n * q)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        q = motion.q(j)
+        damping = motion.par.damping[j] / motion.par.stiffness[j]
+        signals = []
+        for unit in (np.sin(shape[0] * q), np.cos(shape[0] * q)):
+            X = motion.lines(unit)
+            signals.append(k * (1 + 1j * motion.group.omega * damping) * X)
+        return Screen(tuple(signals), lambda c: np.array([c[0], shape[0], c[1]]), shape)
+
+    return Hypothesis(
+        "transmission_error",
+        place,
+        joint,
+        "spring",
+        (
+            Parameter("sine", "rad", -0.1, 0.1, step=1e-7),
+            Parameter("periods_per_rev", "1", 0.3, 1e5, step=1e-3),
+            Parameter("cosine", "rad", -0.1, 0.1, step=1e-7),
+        ),
+        lambda p, motion, j, k: error(*p, motion, j),
+        lambda scale: [(n,) for n in scale.wave_numbers],
+        screen,
+        "The gear of {joint} has a kinematic error of {amplitude:.3g} rad, {periods_per_rev:.4g} periods a turn"
+        " of the joint: a ripple that grows near resonance.",
+        variable="q",
+        options={"kinematic": True},
+    )

@@ -1,0 +1,287 @@
+"""Motor torque along measured motor motion: the nonlinear gray-box, inverted.
+
+The elastic coordinates are solved from the measured motor motion: a stable problem that needs no
+controller, because with the motors prescribed the link side hangs on its springs. Linear dynamics
+are exact in the frequency domain; what is nonlinear enters as torques evaluated in time:
+
+    A(s) Q_a = S (C T Q_m + H) - W - L,      tau_s = C (T Q_m - S^T Q_a) + H
+    U        = (s^2 J + s f) Q_m + T^T tau_s + F
+
+``W`` is what inverse dynamics along ``q_a(t)`` has beyond the linearised arm (geometry), ``H`` a
+torque in parallel with a spring, ``L`` one on the link side, ``F`` one at the motor. Effects supply
+``H``, ``L``, ``F``, a correction of the position signal, or a filter of the recorded torque.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+import scipy.fft
+
+from ident.graybox import (
+    Linearisation,
+    Parameters,
+    Structure,
+    alias_response,
+    equilibrium,
+    hold_response,
+    impedance,
+    linearise,
+)
+from ident.records import Group
+
+REMAINDER_STEPS = 8  # fixed-point steps for the geometric remainder from a cold start
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How torque and position were sampled: sample time, s, and the hold of the torque."""
+
+    sample_time: float
+    hold: str
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The arm linearised at a group's posture, at its lines.
+
+    Attributes:
+        lin: equilibrium and matrices.
+        s: (L,) j omega.
+        Z: (L, n, n) motor torque per motor position, continuous.
+        A_inv: (L, N, N); C: (L, n).
+        record: (L,) recorded torque per continuous torque.
+        spring_gain: (L, n, n) motor torque per torque in parallel with a spring.
+        link_gain: (L, n, N) motor torque per opposing torque on a link coordinate.
+    """
+
+    lin: Linearisation
+    s: np.ndarray
+    Z: np.ndarray
+    A_inv: np.ndarray
+    C: np.ndarray
+    record: np.ndarray
+    spring_gain: np.ndarray
+    link_gain: np.ndarray
+
+
+def make_plane(structure: Structure, par: Parameters, group: Group, sampling: Sampling) -> Plane:
+    """Linearise a group at its own parameter-dependent equilibrium."""
+    lin = linearise(structure, equilibrium(structure, par, group.posture))
+    hold = hold_response(group.omega, sampling.sample_time, sampling.hold)
+    return plane_at(structure, par, lin, group, np.exp(1j * group.omega * par.timing) / hold)
+
+
+def plane_at(
+    structure: Structure, par: Parameters, lin: Linearisation, group: Group, record: np.ndarray
+) -> Plane:
+    """The linear arm at a given linearisation; ``record`` (L,) as in ``Plane``."""
+    s = 1j * group.omega
+    Z, A_inv, C = impedance(structure, par, lin, s)
+    driven = structure.driven
+    link_gain = par.coupling.T @ (C[:, :, None] * A_inv[:, driven, :])
+    spring_gain = par.coupling.T - link_gain[:, :, driven]
+    return Plane(lin, s, Z, A_inv, C, record, spring_gain, link_gain)
+
+
+@dataclass(frozen=True)
+class Torques:
+    """What effects add to the linear arm, as spectra; each (S, L, n) or (S, L, N) for ``link``."""
+
+    spring: np.ndarray | float = 0.0
+    link: np.ndarray | float = 0.0
+    motor: np.ndarray | float = 0.0
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A prediction and its parts; spectra of (S, L, .)."""
+
+    Q: np.ndarray
+    Q_a: np.ndarray
+    delta: np.ndarray
+    tau_s: np.ndarray
+    U: np.ndarray
+    W: np.ndarray
+    torques: Torques
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Time signals of a solution, made where they are asked for; each (S, T) on the group's grid."""
+
+    group: Group
+    solution: Solution
+    par: Parameters
+
+    def q(self, joint: int) -> np.ndarray:
+        """Motor position, rad."""
+        return self._time(self.solution.Q, joint)
+
+    def v(self, joint: int) -> np.ndarray:
+        """Motor velocity, rad/s."""
+        return self._time(self.solution.Q, joint, 1)
+
+    def acceleration(self, joint: int) -> np.ndarray:
+        """Motor acceleration, rad/s2."""
+        return self._time(self.solution.Q, joint, 2)
+
+    def delta(self, joint: int) -> np.ndarray:
+        """Deflection of the gear, rad."""
+        return self._time(self.solution.delta, joint)
+
+    def delta_rate(self, joint: int) -> np.ndarray:
+        """Its rate, rad/s."""
+        return self._time(self.solution.delta, joint, 1)
+
+    def tau_s(self, joint: int) -> np.ndarray:
+        """Torque that the gear carries, N m."""
+        return self._time(self.solution.tau_s, joint)
+
+    def q_link(self, coordinate: int) -> np.ndarray:
+        """Link coordinate, rad."""
+        return self._time(self.solution.Q_a, coordinate)
+
+    def v_link(self, coordinate: int) -> np.ndarray:
+        """Its velocity, rad/s."""
+        return self._time(self.solution.Q_a, coordinate, 1)
+
+    def torque(self, joint: int) -> np.ndarray:
+        """Recorded motor torque, N m."""
+        return self._time(self.group.U, joint)
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time since the start of the recording, s."""
+        T = self.group.n_time
+        return self.group.start[:, None] + np.arange(T) * self.group.period_time / T
+
+    @property
+    def time_step(self) -> float:
+        """Step of the grid, s."""
+        return self.group.period_time / self.group.n_time
+
+    def lines(self, x: np.ndarray) -> np.ndarray:
+        """Time signal (S, T) to spectrum (S, L)."""
+        return self.group.to_lines(x[..., None])[..., 0]
+
+    def _time(self, X: np.ndarray, column: int, order: int = 0) -> np.ndarray:
+        x = X[..., column] * (1j * self.group.omega) ** order if order else X[..., column]
+        return self.group.to_time(x[..., None])[..., 0]
+
+
+def true_position(group: Group, par: Parameters, sampling: Sampling) -> np.ndarray:
+    """Motor position without what the images of the held torque add; (S, L, n) rad."""
+    alias = alias_response(group.omega, sampling.sample_time, sampling.hold)
+    return group.Q - alias[:, None] * group.U / par.inertia
+
+
+def static_remainder(structure: Structure, par: Parameters, plane: Plane, group: Group) -> np.ndarray:
+    """Remainder of the arm at rest: the gravity torque about which it is linearised; (S, L, N)."""
+    S, L = group.U.shape[:2]
+    W = np.zeros((S, L, structure.n_coordinates), complex)
+    W[:, 0] = plane.lin.g - plane.lin.Kg @ plane.lin.q
+    return W
+
+
+def link_motion(
+    structure: Structure, par: Parameters, plane: Plane, Q: np.ndarray, W: np.ndarray, torques: Torques
+) -> np.ndarray:
+    """Link coordinates (S, L, N) with the motors prescribed."""
+    drive = plane.C * (Q @ par.coupling.T) + torques.spring
+    load = -W - torques.link
+    load[..., structure.driven] += drive
+    return np.matmul(plane.A_inv, load[..., None])[..., 0]
+
+
+def geometric_remainder(structure: Structure, plane: Plane, group: Group, Q_a: np.ndarray) -> np.ndarray:
+    """Inverse dynamics along ``q_a`` less the linearised arm; (S, L, N) N m."""
+    s = plane.s[:, None]
+    coarse = coarse_group(group)
+    q = coarse.to_time(Q_a)
+    v = coarse.to_time(s * Q_a)
+    a = coarse.to_time(s**2 * Q_a)
+    tau = inverse_dynamics(structure, q, v, a)
+    linear = a @ plane.lin.M + q @ plane.lin.Kg.T
+    return coarse.to_lines(tau - linear)
+
+
+def inverse_dynamics(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Recursive Newton-Euler over arrays (..., N), by Pinocchio on all threads; (..., N) N m."""
+    shape = q.shape
+    pool = pin.ModelPool(structure.model, 2)
+    columns = [np.asfortranarray(x.reshape(-1, shape[-1]).T) for x in (q, v, a)]
+    return np.ascontiguousarray(pin.rneaInParallel(2, pool, *columns).T).reshape(shape)
+
+
+def solve(
+    structure: Structure,
+    par: Parameters,
+    plane: Plane,
+    group: Group,
+    sampling: Sampling,
+    *,
+    Q: np.ndarray | None = None,
+    W: np.ndarray | None = None,
+    torques: Torques = Torques(),
+    steps: int = 0,
+) -> Solution:
+    """Recorded motor torque that the model predicts along the measured motion.
+
+    Args:
+        Q: (S, L, n) motor position; ``true_position`` where None.
+        W: (S, L, N) geometric remainder to start from; that of the arm at rest where None.
+        torques: what effects add.
+        steps: fixed-point steps on the remainder.
+    """
+    if Q is None:
+        Q = true_position(group, par, sampling)
+    if W is None:
+        W = static_remainder(structure, par, plane, group)
+    for _ in range(steps):
+        Q_a = link_motion(structure, par, plane, Q, W, torques)
+        W_next = geometric_remainder(structure, plane, group, Q_a)
+        change, W = np.abs(W_next - W).max(), W_next
+        if change < 1e-7 * np.abs(W).max():
+            break
+    Q_a = link_motion(structure, par, plane, Q, W, torques)
+    delta = Q @ par.coupling.T - Q_a[..., structure.driven]
+    tau_s = plane.C * delta + torques.spring
+    s = plane.s[:, None]
+    U = (s**2 * par.inertia + s * par.viscous) * Q + tau_s @ par.coupling + torques.motor
+    return Solution(Q, Q_a, delta, tau_s, plane.record[:, None] * U, W, torques)
+
+
+def baseline_jacobian(
+    structure: Structure, par: Parameters, plane: Plane, solution: Solution
+) -> np.ndarray:
+    """Derivative of the predicted torque by the log-parameters and, last, the timing.
+
+    Torques of effects and the geometric remainder are held. Returns (S, L, n, n_theta).
+    """
+    n, n_e = structure.n, len(structure.elastic)
+    S, L = solution.U.shape[:2]
+    s = plane.s
+    out = np.zeros((S, L, n, 4 * n + 2 * n_e + 1), complex)
+    rec = plane.record[:, None, None]
+    spring = rec * plane.spring_gain
+    out[..., :n] = spring * (par.stiffness * solution.delta)[:, :, None, :]
+    out[..., n : 2 * n] = spring * (par.damping * s[:, None] * solution.delta)[:, :, None, :]
+    k = np.arange(n)
+    motor = plane.record[:, None] * s[:, None] * solution.Q
+    out[..., k, 2 * n + k] = motor * s[:, None] * par.inertia
+    out[..., k, 3 * n + k] = motor * par.viscous
+    if n_e:
+        hinge = rec * plane.link_gain[:, :, structure.elastic]
+        q_e = solution.Q_a[..., structure.elastic]
+        out[..., 4 * n : 4 * n + n_e] = hinge * (par.elastic_stiffness * q_e)[:, :, None, :]
+        out[..., 4 * n + n_e : -1] = hinge * (par.elastic_damping * s[:, None] * q_e)[:, :, None, :]
+    out[..., -1] = s[:, None] * solution.U
+    return out
+
+
+def coarse_group(group: Group) -> Group:
+    """The group on the grid of the geometric remainder: of low order, four points a line do."""
+    return replace(group, n_time=scipy.fft.next_fast_len(4 * len(group.omega), real=True))

@@ -1,0 +1,110 @@
+"""Noise of the torque residual, from the scatter between periods.
+
+What circulates in the closed loop obeys the plant and cancels in ``e = U - Z Q``; what is left is
+measurement noise ``n_u - Z n_q`` and torque noise that enters the plant. Its covariance is the
+weight that makes torque-residual matching the maximum-likelihood form of FRF matching
+(Pintelon and Schoukens 2012, ch. 9; theory.md section 2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.optimize
+
+from ident.records import Group
+
+PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
+SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
+
+
+def white_covariance(Z: np.ndarray, tau_var: np.ndarray, q_var: np.ndarray) -> np.ndarray:
+    """``diag(tau_var) + Z diag(q_var) Z^H``; (L, n, n).
+
+    Args:
+        Z: (L, n, n) recorded torque per motor position.
+        tau_var, q_var: (n,) variance of a spectral line of each channel.
+    """
+    out = (Z * q_var) @ np.conj(np.swapaxes(Z, 1, 2))
+    k = np.arange(Z.shape[1])
+    out[:, k, k] += tau_var
+    return out
+
+
+def residual_covariance(
+    group: Group,
+    Z: np.ndarray,
+    *,
+    tau_std: np.ndarray,
+    q_std: np.ndarray,
+    samples: int,
+) -> np.ndarray:
+    """Covariance of the compared lines of the mean torque residual; (K, n, n).
+
+    Args:
+        group: the records.
+        Z: (L, n, n) recorded torque per motor position.
+        tau_std, q_std: (n,) sample noise, used where single periods give no scatter.
+        samples: samples per period.
+
+    The shape over frequency is that of white channel noise carried by ``Z``; the scatter between
+    periods sets its size, and corrects its shape by a smooth matrix where there is enough of it.
+    """
+    P = group.U_periods.shape[1]
+    if P < 2:
+        S = white_covariance(Z, tau_std**2 / samples, q_std**2 / samples)
+        return S[group.keep]
+    e = group.U_periods - np.einsum("lij,splj->spli", Z, group.Q_periods, optimize=True)
+    d = (e - e.mean(axis=1, keepdims=True))[:, :, group.keep]
+    scale = e.shape[0] * (P - 1) * P
+    Zk = Z[group.keep]
+    power = np.einsum("spki->ki", np.abs(d) ** 2) / scale
+    tau_var, q_var = _white_levels(power, Zk)
+    S = white_covariance(Zk, tau_var, q_var)
+    root = np.linalg.cholesky(S)
+    white = np.linalg.solve(root[None, None], d[..., None])[..., 0]
+    scatter = np.einsum("spki,spkj->kij", white, white.conj(), optimize=True) / scale
+    dof_line = e.shape[0] * (P - 1)
+    half = int(np.ceil(0.5 * SMOOTH_DOF / dof_line))
+    smooth, count = _moving_mean(scatter, half)
+    dof = (count * dof_line)[:, None, None]
+    shape = (dof * smooth + PRIOR_DOF * np.eye(Z.shape[1])) / (dof + PRIOR_DOF)
+    return root @ shape @ np.conj(np.swapaxes(root, 1, 2))
+
+
+def difference_noise(x: np.ndarray) -> np.ndarray:
+    """Standard deviation of white noise on a smooth signal (N, n), from fourth differences; (n,).
+
+    ``var(diff^4 x) = 70 var(x)`` for white noise; the median makes it blind to spikes.
+    """
+    d = np.diff(x, n=4, axis=0)
+    return 1.4826 * np.median(np.abs(d - np.median(d, axis=0)), axis=0) / np.sqrt(70.0)
+
+
+def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Non-negative channel variances that explain the line power (K, n) of the residual."""
+    n = power.shape[1]
+    gain = np.abs(Z) ** 2
+    columns = np.zeros((power.shape[0], n, 2 * n))
+    k = np.arange(n)
+    columns[:, k, k] = 1.0
+    columns[:, :, n:] = gain
+    floor = 1e-12 * np.maximum(power.mean(axis=0), 1e-300)
+    weight = 1.0 / np.maximum(power.mean(axis=0), 1e-300) * np.ones_like(power)
+    level = np.zeros(2 * n)
+    for _ in range(4):
+        A = (columns * weight[..., None])[1:].reshape(-1, 2 * n)
+        b = (power * weight)[1:].ravel()
+        size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+        level = scipy.optimize.nnls(A / size, b)[0] / size
+        model = columns @ level + floor
+        weight = 1.0 / model
+    return level[:n] + floor, level[n:] + 1e-12 * floor
+
+
+def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over lines k-half..k+half, and how many lines entered."""
+    total = np.cumsum(np.concatenate([np.zeros_like(x[:1]), x]), axis=0)
+    k = np.arange(len(x))
+    low, high = np.maximum(k - half, 0), np.minimum(k + half + 1, len(x))
+    count = high - low
+    return (total[high] - total[low]) / count[:, None, None], count

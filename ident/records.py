@@ -1,0 +1,230 @@
+"""Segments reduced to what the torque equation needs: spectra of torque and position.
+
+A record group holds the segments of one operating point that share a period. A motion without
+periodicity is a group of its own: it is closed into a period by a smooth return, and a window
+keeps the return and the first transient out of every comparison.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+
+from ident.dataset import Dataset, Segment
+from robot_assets.errors import DataError
+
+RETURN_TIME = 1.0  # s, least time in which a motion is led back to its start
+SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
+POINTS_PER_LINE = 8  # time grid of nonlinear laws, in points per highest line
+
+
+@dataclass(frozen=True)
+class Group:
+    """Periodic records that share posture and frequency grid.
+
+    Spectra are ``rfft(x) / period``: ``x(t) = X_0 + 2 Re sum_k X_k exp(j k 2 pi t / T)``.
+
+    Attributes:
+        operating_point: name of the posture, or of the segment for a motion.
+        segments: names, S of them.
+        U, Q: (S, L, n) mean spectra of torque (N m) and motor position (rad), lines 0..L-1.
+        U_periods, Q_periods: (S, P, L, n) single periods, P >= 1.
+        Q_link: (S, L, n) of the link encoders, or None.
+        omega: (L,) rad/s.
+        keep: (K,) lines that are compared (a subset of 0..L-1).
+        excited: (S, L) True where a segment excites.
+        n_time: points of the time grid over one period.
+        window: (n_time,) weight of a motion in the time domain, or None for periodic data.
+        amplitude: (S,) relative level.
+        start: (S,) s, time of the first sample, for drift over the recording.
+        temperature: (S, n) degC means, or None.
+        period_time: s.
+        periods: (S,) number of periods averaged.
+    """
+
+    operating_point: str
+    segments: tuple[str, ...]
+    U: np.ndarray
+    Q: np.ndarray
+    U_periods: np.ndarray
+    Q_periods: np.ndarray
+    Q_link: np.ndarray | None
+    omega: np.ndarray
+    keep: np.ndarray
+    excited: np.ndarray
+    n_time: int
+    window: np.ndarray | None
+    amplitude: np.ndarray
+    start: np.ndarray
+    temperature: np.ndarray | None
+    period_time: float
+    periods: np.ndarray
+
+    @property
+    def posture(self) -> np.ndarray:
+        """(n,) mean motor position, rad."""
+        return self.Q[:, 0].real.mean(axis=0)
+
+    def to_time(self, X: np.ndarray) -> np.ndarray:
+        """Spectrum (..., L, m) on the time grid (..., n_time, m)."""
+        return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward", workers=2)
+
+    def to_lines(self, x: np.ndarray) -> np.ndarray:
+        """Time grid (..., n_time, m) to spectrum (..., L, m)."""
+        full = scipy.fft.rfft(x, axis=-2, norm="forward", workers=2)
+        return full[..., : len(self.omega), :]
+
+    def observe(self, X: np.ndarray) -> np.ndarray:
+        """What of a torque spectrum (..., L, m) is compared: its windowed lines (..., K, m)."""
+        if self.window is not None:
+            X = self.to_lines(self.to_time(X) * self.window[:, None])
+        return X[..., self.keep, :]
+
+
+def build_groups(
+    dataset: Dataset,
+    *,
+    role: str | None = "identification",
+    band_hz: float | None = None,
+    motion_band_hz: float | None = None,
+) -> tuple[Group, ...]:
+    """Groups of all segments of a role.
+
+    Args:
+        dataset: the data.
+        role: "identification", "validation", or None for all.
+        band_hz: highest compared frequency of periodic data; the highest excited line where None.
+        motion_band_hz: the same for motions; 10 Hz or a tenth of the sample rate where None.
+
+    Raises:
+        DataError: where no segment of the role is left.
+    """
+    groups: dict[tuple, list[Segment]] = {}
+    for segment in dataset.segments:
+        if role is not None and segment.role != role:
+            continue
+        if segment.kind == "multisine":
+            key: tuple = (segment.operating_point, segment.period, segment.steady_periods)
+        else:
+            key = ("trajectory", segment.name)
+        groups.setdefault(key, []).append(segment)
+    if not groups:
+        raise DataError("segments", str(dataset.path or dataset.name), f"none of role {role}", "at least one")
+    top = band_hz or highest_line_hz(dataset)
+    motion_top = motion_band_hz or min(10.0, dataset.sample_rate / 10)
+    return tuple(
+        _motion_group(dataset, members[0], motion_top)
+        if members[0].kind == "trajectory"
+        else _periodic_group(dataset, members, top)
+        for members in groups.values()
+    )
+
+
+def highest_line_hz(dataset: Dataset) -> float:
+    """Highest excited frequency of the identification multisines, Hz; 0.4 of Nyquist without."""
+    tops = [
+        max(s.excited_lines) * dataset.sample_rate / s.period
+        for s in dataset.segments
+        if s.kind == "multisine" and len(s.excited_lines)
+    ]
+    return float(max(tops)) if tops else 0.2 * dataset.sample_rate
+
+
+def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) -> Group:
+    first = members[0]
+    fs, N = dataset.sample_rate, int(first.period)
+    top = min(int(np.floor(band_hz * N / fs + 1e-9)), N // 2 - 1)
+    n_lines = min(int(np.ceil(1.15 * top)) + 2, N // 2)
+    U_p = np.stack([_lines(s.periodic("tau"), n_lines) for s in members])
+    Q_p = np.stack([_lines(s.periodic("q"), n_lines) for s in members])
+    link = None
+    if all(s.q_link is not None for s in members):
+        link = np.stack([_lines(s.periodic("q_link"), n_lines).mean(axis=0) for s in members])
+    excited = np.zeros((len(members), n_lines), bool)
+    for i, s in enumerate(members):
+        lines = np.asarray(s.excited_lines, int)
+        excited[i, lines[lines < n_lines]] = True
+    temps = [s.temp for s in members]
+    return Group(
+        operating_point=str(first.operating_point),
+        segments=tuple(s.name for s in members),
+        U=U_p.mean(axis=1),
+        Q=Q_p.mean(axis=1),
+        U_periods=U_p,
+        Q_periods=Q_p,
+        Q_link=link,
+        omega=2 * np.pi * np.arange(n_lines) * fs / N,
+        keep=np.arange(top + 1),
+        excited=excited,
+        n_time=scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True),
+        window=None,
+        amplitude=np.array([s.amplitude for s in members]),
+        start=np.array([s.t[0] for s in members]),
+        temperature=None if any(x is None for x in temps) else np.stack([x.mean(axis=0) for x in temps]),
+        period_time=N / fs,
+        periods=np.array([s.steady_periods for s in members]),
+    )
+
+
+def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:
+    """(P, N, n) time samples to (P, n_lines, n) spectra."""
+    return scipy.fft.rfft(x, axis=1, norm="forward", workers=2)[:, :n_lines]
+
+
+def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
+    fs = dataset.sample_rate
+    n_return = int(np.ceil(max(RETURN_TIME, 0.05 * len(segment.t) / fs) * fs))
+    N = scipy.fft.next_fast_len(len(segment.t) + n_return, real=True)
+    n_return = N - len(segment.t)
+    q = close_motion(segment.q, n_return)
+    tau = close_motion(segment.tau, n_return)
+    top = min(int(band_hz * N / fs), N // 2 - 1)
+    n_lines = min(int(1.5 * top) + 2, N // 2)
+    n_time = scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True)
+    time = np.arange(n_time) * N / fs / n_time
+    ramp = min(SETTLE_TIME, 0.1 * len(segment.t) / fs)
+    end = len(segment.t) / fs
+    window = np.clip(time / ramp, 0, 1) * np.clip((end - time) / ramp, 0, 1)
+    window = np.sin(0.5 * np.pi * window) ** 2
+    U = _lines(tau[None], n_lines)
+    Q = _lines(q[None], n_lines)
+    link = None
+    if segment.q_link is not None:
+        link = _lines(close_motion(segment.q_link, n_return)[None], n_lines)
+    return Group(
+        operating_point=segment.operating_point or segment.name,
+        segments=(segment.name,),
+        U=U,
+        Q=Q,
+        U_periods=U[:, None],
+        Q_periods=Q[:, None],
+        Q_link=link,
+        omega=2 * np.pi * np.arange(n_lines) * fs / N,
+        keep=np.arange(top + 1),
+        excited=np.zeros((1, n_lines), bool),
+        n_time=n_time,
+        window=window,
+        amplitude=np.ones(1),
+        start=segment.t[:1],
+        temperature=None if segment.temp is None else segment.temp.mean(axis=0)[None],
+        period_time=N / fs,
+        periods=np.ones(1, int),
+    )
+
+
+def close_motion(x: np.ndarray, n_return: int) -> np.ndarray:
+    """Append a return from the last sample to the first with matching slope; (N + n_return, n).
+
+    A cubic in position: no jump in value or slope enters the spectrum.
+    """
+    width = min(20, len(x) // 4)
+    v_end = (x[-1] - x[-1 - width]) / width
+    v_start = (x[width] - x[0]) / width
+    u = (np.arange(1, n_return + 1) / (n_return + 1))[:, None]
+    span = n_return + 1
+    h00, h10 = 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u
+    h01, h11 = -2 * u**3 + 3 * u**2, u**3 - u**2
+    bridge = h00 * x[-1] + h10 * span * v_end + h01 * x[0] + h11 * span * v_start
+    return np.concatenate([x, bridge])

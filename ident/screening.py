@@ -1,0 +1,260 @@
+"""Cheap scores of every hypothesis: how much of the residual its unit responses explain.
+
+For unit responses ``X`` of a hypothesis, whitened, with the fitted coordinates projected out:
+``gain = (X^T P r)^T (X^T P X)^{-1} (X^T P r)``, the fall of the cost that a linear step in its
+weights gives (score test, Rao 1948; theory.md 9.3). Only normal matrices are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.extended import Prediction
+from ident.hypotheses import Hypothesis, SignalScale
+from ident.inverse import Motion
+from ident.records import Group
+from ident.torque_fit import Fit, Problem, jacobian, observe_columns, residual
+
+
+@dataclass(frozen=True)
+class Score:
+    """Best unit response of a hypothesis: fall of the cost, its degrees of freedom, a start."""
+
+    hypothesis: Hypothesis
+    gain: float
+    dof: int
+    start: np.ndarray | None
+    weights: np.ndarray
+    shape: tuple[float, ...]
+
+
+def signal_scale(
+    problem: Problem, predictions: Sequence[Prediction], joint: int, wave_numbers: tuple[float, ...]
+) -> SignalScale:
+    """Sizes of a joint's signals over all records."""
+    v, q, delta, torque, res, peak = [], [], [], [], [], []
+    starts, resonances = [], []
+    for group, pred in zip(problem.groups, predictions, strict=True):
+        motion = pred.motion(group)
+        v.append(np.mean(motion.v(joint) ** 2))
+        x = motion.q(joint)
+        q.append(np.mean((x - x.mean(axis=1, keepdims=True)) ** 2))
+        delta.append(np.abs(motion.delta(joint)).ravel()[::7])
+        u = motion.torque(joint)
+        torque.append(np.mean((u - u.mean(axis=1, keepdims=True)) ** 2))
+        peak.append(np.abs(u).max())
+        r = group.to_time((group.U - pred.U)[..., joint : joint + 1])
+        res.append(np.mean(r**2))
+        starts += [*group.start, *(group.start + group.period_time)]
+        resonances.append(group.omega[group.keep[-1]] / 2 / np.pi)
+    all_delta = np.concatenate(delta)
+    top = float(np.median(resonances))
+    return SignalScale(
+        v=float(np.sqrt(np.mean(v))),
+        q=float(np.sqrt(np.mean(q))),
+        delta=np.quantile(all_delta, [0.1, 0.5, 0.9, 0.995]),
+        torque=float(np.sqrt(np.mean(torque))),
+        residual=float(np.sqrt(np.mean(res))),
+        stiffness=float(predictions[0].par.stiffness[joint]),
+        wave_numbers=wave_numbers,
+        peak_torque=float(max(peak)),
+        duration=float(max(starts) - min(starts)) if len(set(np.round(starts, 3))) > 2 else 0.0,
+        resonances=tuple(top * f for f in (0.06, 0.12, 0.22, 0.35, 0.55, 0.85)),
+    )
+
+
+def screen(
+    problem: Problem,
+    fit: Fit,
+    predictions: Sequence[Prediction],
+    hypotheses: Sequence[Hypothesis],
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> list[Score]:
+    """Score every hypothesis, best first."""
+    base = _Base.build(problem, fit, predictions)
+    joints = problem.structure.n
+    scales = [
+        signal_scale(
+            problem, predictions, j, position_lines(problem, predictions, j)
+        )
+        for j in range(joints)
+    ]
+    motions = [pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True)]
+    scores = []
+    for i, h in enumerate(hypotheses):
+        scale = scales[h.joint if h.joint >= 0 else 0]
+        best: Score | None = None
+        for shape in h.shapes(scale):
+            score = _score(problem, fit, base, predictions, motions, h, shape)
+            if score is not None and (best is None or score.gain > best.gain):
+                best = score
+        if best is not None:
+            scores.append(best)
+        if progress is not None:
+            progress((i + 1) / len(hypotheses))
+    return sorted(scores, key=lambda s: -s.gain)
+
+
+@dataclass(frozen=True)
+class _Base:
+    """Whitened residual and fitted-coordinate columns, and their normal matrix inverse."""
+
+    residuals: tuple[np.ndarray, ...]
+    columns: tuple[np.ndarray, ...]
+    inverse: np.ndarray
+    moment: np.ndarray
+
+    @classmethod
+    def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Base:
+        residuals, columns = [], []
+        for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
+            J = observe_columns(group, jacobian(problem, fit.model, group, pred))
+            columns.append(fit.weights.apply(g, J).reshape(-1, J.shape[-1]))
+            residuals.append(fit.weights.apply(g, residual(group, pred)).ravel())
+        H = sum(J.T @ J for J in columns)
+        moment = sum(J.T @ r for J, r in zip(columns, residuals, strict=True))
+        size = np.sqrt(np.maximum(np.diag(H), 1e-30))
+        inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-10, hermitian=True) / np.outer(size, size)
+        return cls(tuple(residuals), tuple(columns), inverse, moment)
+
+
+def _score(
+    problem: Problem,
+    fit: Fit,
+    base: _Base,
+    predictions: Sequence[Prediction],
+    motions: Sequence[Motion],
+    h: Hypothesis,
+    shape: tuple[float, ...],
+) -> Score | None:
+    G = b = C = None
+    start: Callable[[np.ndarray], np.ndarray | None] = h.options.get("start", lambda c: None)
+    for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
+        if h.channel == "model":
+            units = h.options["responses"](pred.structure, pred.par, pred.plane, group, pred.solution, shape)
+            X = fit.weights.apply(g, observe_columns(group, np.stack(units, axis=-1)))
+        else:
+            made = h.screen(motions[g], h.joint, pred.par.stiffness[h.joint], shape)
+            start = made.start
+            X = _joint_response(fit, g, group, pred, motions[g], h, made.signals)
+        X = X.reshape(-1, X.shape[-1])
+        if h.channel in ("motor", "drive"):
+            rows, J = X, base.columns[g]
+        else:
+            rows, J = X, base.columns[g]
+        G = rows.T @ rows if G is None else G + rows.T @ rows
+        b = rows.T @ base.residuals[g] if b is None else b + rows.T @ base.residuals[g]
+        C = J.T @ rows if C is None else C + J.T @ rows
+    size = np.sqrt(np.maximum(np.diag(G), 1e-300))
+    P = (G - C.T @ base.inverse @ C) / np.outer(size, size)
+    y = (b - C.T @ base.inverse @ base.moment) / size
+    inverse = np.linalg.pinv(P, rcond=1e-9, hermitian=True)
+    weights = inverse @ y
+    gain = float(y @ weights)
+    c = weights / size
+    if not np.isfinite(gain):
+        return None
+    return Score(h, gain, len(c), None if h.channel == "compliance" else _start(start, c, h, shape, problem), c, shape)
+
+
+def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | None:
+    if "hinge" in h.options:
+        from ident.hypotheses.structure import hinge_inertia
+
+        if c[0] < 0.05:
+            return None
+        own = hinge_inertia(problem.structure, h.options["hinge"](1e12, 1.0), problem.groups[0], None)
+        stiffness = own * (2 * np.pi * shape[0]) ** 2 / np.clip(c[0], 0.2, 3.0)
+        return np.array([stiffness, 2 * shape[1] * np.sqrt(own * stiffness)])
+    p = start(c)
+    return None if p is None or not np.all(np.isfinite(p)) else np.asarray(p, float)
+
+
+def _joint_response(
+    fit: Fit, g: int, group: Group, pred: Prediction, motion: Motion, h: Hypothesis, signals: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Whitened responses (2, S, K, n, m) of torque signals at one joint, by their channel."""
+    X = np.stack([x if np.iscomplexobj(x) else motion.lines(x) for x in signals], axis=-1)
+    rec = pred.plane.record[:, None]
+    j = h.joint
+    if h.channel == "motor":
+        gain = rec * np.eye(pred.structure.n)[j]
+    elif h.channel == "spring":
+        gain = rec * pred.plane.spring_gain[:, :, j]
+    elif h.channel == "link":
+        gain = rec * pred.plane.link_gain[:, :, pred.structure.driven[j]]
+    elif h.channel == "position":
+        gain = rec * pred.plane.Z[:, :, j]
+    else:
+        gain = np.broadcast_to(np.eye(pred.structure.n, dtype=complex)[j], (len(group.omega), pred.structure.n))
+    return fit.weights.apply(g, observe_columns(group, gain[None, :, :, None] * X[:, :, None, :]))
+
+
+def position_lines(
+    problem: Problem, predictions: Sequence[Prediction], joint: int, count: int = 3
+) -> tuple[float, ...]:
+    """Wave numbers (1/rad) at which the residual torque of a joint is periodic in its motor angle.
+
+    A least-squares periodogram over the motor angle: for each wave number, sine and cosine with
+    weights of their own in every posture, so that no phase has to be carried between postures;
+    then the best ones are refined with one phase for all.
+    """
+    qs, rs = [], []
+    for group, pred in zip(problem.groups, predictions, strict=True):
+        motion = pred.motion(group)
+        q = motion.q(joint)
+        R = (group.U - pred.U)[..., joint : joint + 1].copy()
+        R[:, group.keep[-1] + 1 :] = 0.0
+        r = group.to_time(R)[..., 0]
+        step = max(1, q.shape[1] // 700)
+        v, a = motion.v(joint), motion.acceleration(joint)
+        for s in range(len(q)):
+            nuisance = np.stack(
+                [np.ones_like(v[s]), q[s] - q[s].mean(), v[s], a[s], np.sign(v[s])], axis=1
+            )[::step]
+            nuisance = np.linalg.qr(nuisance / np.maximum(np.linalg.norm(nuisance, axis=0), 1e-300))[0]
+            x = r[s, ::step]
+            qs.append((q[s, ::step], nuisance))
+            rs.append(x - nuisance @ (nuisance.T @ x))
+    spans = [np.ptp(q) for q, _ in qs]
+    span = float(np.median(spans))
+    if span <= 0:
+        return ()
+    # Small records first lose a phase; the coarse grid resolves the median excursion.
+    coarse = np.arange(1.0, 260.0) * (0.7 * np.pi / max(spans))
+    power = np.zeros(len(coarse))
+    for (q, N), r in zip(qs, rs, strict=True):
+        E = np.exp(1j * np.outer(q - q.mean(), coarse))
+        E = E - N @ (N.T @ E)
+        c, s = E.real, E.imag
+        cc, ss, cs = (c * c).sum(0), (s * s).sum(0), (c * s).sum(0)
+        y1, y2 = c.T @ r, s.T @ r
+        det = np.maximum(cc * ss - cs**2, 1e-9 * len(r) ** 2)
+        power += (ss * y1**2 - 2 * cs * y1 * y2 + cc * y2**2) / det
+    total = sum(float(r @ r) for r in rs)
+    best: list[float] = []
+    for k in np.argsort(-power):
+        if all(abs(coarse[k] - b) > 2.5 * (coarse[1] - coarse[0]) for b in best):
+            best.append(float(coarse[k]))
+        if len(best) == count or power[k] < 1e-3 * total:
+            break
+    return tuple(_refine(qs, rs, n, coarse[1] - coarse[0]) for n in best)
+
+
+def _refine(qs, rs, center: float, width: float) -> float:
+    """Best wave number near ``center`` with one phase for all records."""
+    spread = np.ptp([q.mean() for q, _ in qs]) + np.ptp(qs[0][0])
+    fine = np.linspace(center - 1.5 * width, center + 1.5 * width, int(np.clip(6 * width * spread, 41, 3000)))
+    cc = ss = cs = y1 = y2 = 0.0
+    for (q, N), r in zip(qs, rs, strict=True):
+        stride = max(1, len(q) // 250)
+        E = np.exp(1j * np.outer(q[::stride], fine))
+        c, s, x = E.real, E.imag, r[::stride]
+        cc, ss, cs = cc + (c * c).sum(0), ss + (s * s).sum(0), cs + (c * s).sum(0)
+        y1, y2 = y1 + c.T @ x, y2 + s.T @ x
+    det = np.maximum(cc * ss - cs**2, 1e-300)
+    return float(fine[np.argmax((ss * y1**2 - 2 * cs * y1 * y2 + cc * y2**2) / det)])

@@ -1,0 +1,374 @@
+"""Maximum-likelihood fit of the gray-box, with effects, to the torque residual.
+
+Levenberg-Marquardt on ``sum e^H Lambda^-1 e`` with ``e = U - U_model(theta; q)`` over all compared
+lines of all segments. A relative error added to the noise (``rho``) and taken away in steps makes
+the first steps act as a logarithmic criterion does: from starting guesses off by a factor of two
+the plain weighted criterion would stop in wrong minima.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.extended import Effect, Model, Prediction, predict, predict_at
+from ident.graybox import Parameters, Structure
+from ident.inverse import Sampling, baseline_jacobian
+from ident.noise import residual_covariance
+from ident.records import Group
+
+PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
+PRIOR_TIMING = 0.25  # of the common timing offset, samples
+TIMING_LIMIT = 0.6  # samples
+ANNEALING = (0.5, 0.1, 0.02, 0.0)
+GAP = 1e-6  # relative change of the cost that ends a fit
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Data and weights of a fit.
+
+    Attributes:
+        groups: records.
+        sampling: how they were sampled.
+        nominal: starting guesses, centre of the weak prior.
+        tau_std, q_std: (n,) sample noise where single periods give no scatter.
+        free_timing: whether a common timing offset is fitted.
+    """
+
+    structure: Structure
+    groups: tuple[Group, ...]
+    sampling: Sampling
+    nominal: Parameters
+    tau_std: np.ndarray
+    q_std: np.ndarray
+    free_timing: bool = True
+
+    def samples(self, group: Group) -> int:
+        return int(round(group.period_time / self.sampling.sample_time))
+
+
+@dataclass(frozen=True)
+class Weights:
+    """(K, n, n) whitening per group: real-stacked residuals have unit variance under noise."""
+
+    whiten: tuple[np.ndarray, ...]
+    covariance: tuple[np.ndarray, ...]
+
+    def apply(self, g: int, X: np.ndarray) -> np.ndarray:
+        """Whiten (S, K, n) or (S, K, n, p) and stack real and imaginary parts in front."""
+        W = self.whiten[g]
+        Y = np.matmul(W, X if X.ndim == 4 else X[..., None])
+        Y = Y if X.ndim == 4 else Y[..., 0]
+        return np.stack([Y.real, Y.imag])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of a fit.
+
+    Attributes:
+        model: chain, parameters and effects at the minimum.
+        cost: whitened sum of squares, prior excluded.
+        count: real data that entered.
+        information: (p, p) normal matrix of the fitted coordinates, prior excluded.
+        names: of the fitted coordinates.
+        remainders: geometric remainder per group, for warm starts.
+        weights: of the last iteration.
+        converged: whether the step criterion was met.
+    """
+
+    model: Model
+    cost: float
+    count: int
+    information: np.ndarray
+    names: tuple[str, ...]
+    remainders: tuple[np.ndarray, ...]
+    weights: Weights
+    converged: bool
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return self.cost / max(self.count - len(self.names), 1)
+
+    def covariance(self) -> np.ndarray:
+        """(p, p) of the fitted coordinates, scaled by the misfit where that exceeds one."""
+        ridge = 1e-12 * np.diag(np.maximum(np.diag(self.information), 1e-30))
+        return np.linalg.pinv(self.information + ridge, hermitian=True) * max(1.0, self.chi2_per_dof)
+
+
+def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float) -> Weights:
+    """Weights at the current model; ``rho`` is a relative error added to the noise."""
+    whiten, covariance = [], []
+    for group, pred in zip(problem.groups, predictions, strict=True):
+        Z = pred.plane.record[:, None, None] * pred.plane.Z
+        S = residual_covariance(
+            group, Z, tau_std=problem.tau_std, q_std=problem.q_std, samples=problem.samples(group)
+        )
+        if group.window is not None:
+            S = S * np.mean(group.window**2)
+        S = S.copy()
+        k = np.arange(S.shape[1])
+        S[0] *= 4.0
+        if rho > 0:
+            power = np.mean(np.abs(group.U[:, group.keep]) ** 2, axis=0)
+            power[1:] += 1e-2 * power[1:].mean(axis=0)
+            S[:, k, k] += rho**2 * power
+        root = np.linalg.inv(np.linalg.cholesky(S)) * np.sqrt(2.0)
+        root[0] /= np.sqrt(2.0)
+        whiten.append(root)
+        covariance.append(S)
+    return Weights(tuple(whiten), tuple(covariance))
+
+
+def residual(group: Group, prediction: Prediction) -> np.ndarray:
+    """Measured less predicted recorded torque at the compared lines; (S, K, n) complex, N m."""
+    return group.observe(group.U - prediction.U)
+
+
+def data_count(problem: Problem) -> int:
+    """Real numbers that are compared."""
+    total = 0
+    for group in problem.groups:
+        S, n = len(group.segments), group.U.shape[-1]
+        share = 1.0 if group.window is None else float(np.mean(group.window**2))
+        total += int(share * S * n * (2 * len(group.keep) - 1))
+    return total
+
+
+def coordinate_names(model: Model, structure_names: Sequence[str]) -> tuple[str, ...]:
+    """Names of the fitted coordinates: baseline, timing, effects."""
+    names = [*structure_names, "timing"]
+    for effect in model.effects:
+        h = effect.hypothesis
+        names += [f"{h.effect}@{h.place}:{p.name}" for p in h.parameters]
+    return tuple(names)
+
+
+def pack(model: Model) -> np.ndarray:
+    """Fitted coordinates of a model."""
+    parts = [model.par.to_log(), [model.par.timing]]
+    for effect in model.effects:
+        parts.append([q.to_internal(v) for q, v in zip(effect.hypothesis.parameters, effect.p, strict=True)])
+    return np.concatenate([np.asarray(p, float) for p in parts])
+
+
+def unpack(model: Model, x: np.ndarray, limit: float) -> Model:
+    """The model at fitted coordinates ``x``."""
+    m = len(model.par.to_log())
+    par = replace(model.par.with_log(np.clip(x[:m], -40, 60)), timing=float(np.clip(x[m], -limit, limit)))
+    effects, at = [], m + 1
+    for effect in model.effects:
+        ps = effect.hypothesis.parameters
+        values = np.array([q.to_external(v) for q, v in zip(ps, x[at : at + len(ps)], strict=True)])
+        effects.append(Effect(effect.hypothesis, values))
+        at += len(ps)
+    return Model(model.structure, par, tuple(effects))
+
+
+def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> np.ndarray:
+    """Derivative of the predicted recorded torque by the fitted coordinates; (S, L, n, p)."""
+    m = len(model.par.to_log())
+    n, n_e = model.structure.n, len(model.structure.elastic)
+    full = baseline_jacobian(pred.structure, pred.par, pred.plane, pred.solution)
+    extra = len(pred.structure.elastic) - n_e
+    keep = [*range(4 * n + n_e), *range(4 * n + n_e + extra, 4 * n + n_e + extra + n_e), full.shape[-1] - 1]
+    base = full[..., keep] if extra else full
+    for effect in model.effects:
+        h = effect.hypothesis
+        if h.channel == "drive":
+            motion, j = pred.motion(group), h.joint
+            zero = np.zeros_like(pred.U[..., j])
+            offset = h.law(effect.p, motion, j, 0.0, zero)
+            columns = np.moveaxis(base[:, :, j], -1, 0)
+            base[:, :, j] = np.moveaxis(h.law(effect.p, motion, j, 0.0, columns) - offset, 0, -1)
+    for effect in model.effects:
+        h = effect.hypothesis
+        if h.channel == "spring" and not h.options.get("kinematic"):
+            for c in (h.joint, n + h.joint):
+                x = pack(model)
+                x[c] += 1e-3
+                moved = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W)
+                base[..., c] = (moved.U - pred.U) / 1e-3
+    columns = [base]
+    for i, effect in enumerate(model.effects):
+        for c in range(len(effect.p)):
+            columns.append(_effect_column(problem, model, group, pred, i, c)[..., None])
+    out = np.concatenate(columns, axis=-1)
+    if not problem.free_timing:
+        out[..., m] = 0.0
+    return out
+
+
+def _effect_column(
+    problem: Problem, model: Model, group: Group, pred: Prediction, i: int, c: int
+) -> np.ndarray:
+    effect = model.effects[i]
+    h, q = effect.hypothesis, effect.hypothesis.parameters[c]
+    x = q.to_internal(effect.p[c])
+    p = effect.p.copy()
+    step = q.step
+    p[c] = q.to_external(x + step)
+    if p[c] == effect.p[c]:
+        step = -step
+        p[c] = q.to_external(x + step)
+    if h.channel == "motor":
+        motion, j = pred.motion(group), h.joint
+        k = pred.par.stiffness[j]
+        change = h.law(p, motion, j, k) - h.law(effect.p, motion, j, k)
+        out = np.zeros_like(pred.U)
+        X = pred.plane.record * motion.lines(change)
+        for other in model.effects:
+            if other.hypothesis.channel == "drive" and other.hypothesis.joint == j:
+                law = other.hypothesis.law
+                X = law(other.p, motion, j, k, X) - law(other.p, motion, j, k, 0 * X)
+        out[..., j] = X
+        return out / step
+    effects = tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects))
+    moved = Model(model.structure, model.par, effects)
+    if h.channel == "model":
+        U = predict(moved, group, problem.sampling, W=pred.solution.W, steps=1).U
+        base = predict(model, group, problem.sampling, W=pred.solution.W, steps=1).U
+        return (U - base) / step
+    U = predict_at(
+        moved, pred.structure, pred.par, pred.plane, group, problem.sampling, W=pred.solution.W
+    ).U
+    return (U - pred.U) / step
+
+
+def fit(
+    problem: Problem,
+    model: Model,
+    *,
+    base_names: Sequence[str],
+    annealing: Sequence[float] = (0.0,),
+    iterations: int = 12,
+    weights: Weights | None = None,
+    remainders: Sequence[np.ndarray] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Fit:
+    """Fit baseline parameters, timing and effects together.
+
+    Args:
+        model: start.
+        base_names: names of the baseline coordinates.
+        annealing: relative errors added to the noise, one after another; end with 0.
+        iterations: at most, in each stage.
+        weights: fixed weights; made anew in every stage where None.
+        remainders: geometric remainders to start from.
+    """
+    limit = TIMING_LIMIT * problem.sampling.sample_time
+    m = len(model.par.to_log())
+    center = np.concatenate([problem.nominal.to_log(), [0.0]])
+    prior = np.zeros(len(pack(model)))
+    prior[:m] = PRIOR_LOG_STD**-2
+    prior[m] = (PRIOR_TIMING * problem.sampling.sample_time) ** -2
+    Ws = list(remainders) if remainders is not None else [None] * len(problem.groups)
+    count = data_count(problem)
+    fixed = weights
+    converged = False
+    preds: list[Prediction] = []
+    for stage, rho in enumerate(annealing):
+        x = pack(model)
+        preds = [
+            predict(model, g, problem.sampling, W=W, steps=None if W is None else 1)
+            for g, W in zip(problem.groups, Ws, strict=True)
+        ]
+        Ws = [p.solution.W for p in preds]
+        weights = fixed if fixed is not None else make_weights(problem, preds, rho)
+        cost = _cost(problem, preds, weights)
+        damping = 1e-3
+        converged = False
+        for _ in range(iterations):
+            H, b = _normal(problem, model, preds, weights)
+            off = np.concatenate([x[: m + 1] - center, np.zeros(len(x) - m - 1)])
+            H_p, b_p = H + np.diag(prior), b - prior * off
+            size = np.diag(H_p).copy()
+            size[size <= 0] = 1.0
+            improved = False
+            for _ in range(6):
+                step = np.linalg.solve(H_p + damping * np.diag(size), b_p)
+                step[:m] = np.clip(step[:m], -1.0, 1.0)
+                step[m + 1 :] = _clip_effects(model, step[m + 1 :])
+                trial = unpack(model, x + step, limit)
+                try:
+                    new = [
+                        predict(trial, g, problem.sampling, W=W, steps=0)
+                        for g, W in zip(problem.groups, Ws, strict=True)
+                    ]
+                    new_cost = _cost(problem, new, weights)
+                except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+                    new_cost = np.inf
+                penalty = np.sum(prior * (_offset(x + step, center, m) ** 2 - off_sq(off)))
+                if np.isfinite(new_cost) and new_cost + penalty < cost:
+                    improved = True
+                    break
+                damping = max(damping, 1e-4) * 8
+            if not improved:
+                converged = True
+                break
+            gain = cost - new_cost
+            model, x = trial, pack(trial)
+            damping = max(damping / 10, 1e-9)
+            preds = [
+                predict(model, g, problem.sampling, W=W, steps=1)
+                for g, W in zip(problem.groups, Ws, strict=True)
+            ]
+            Ws = [p.solution.W for p in preds]
+            cost = _cost(problem, preds, weights)
+            if progress is not None:
+                progress(f"fit: stage {stage + 1}/{len(annealing)}, chi2/dof {cost / count:.3g}")
+            if gain < max(GAP * cost, 0.02):
+                converged = True
+                break
+    H, _ = _normal(problem, model, preds, weights)
+    return Fit(
+        model, cost, count, H, coordinate_names(model, base_names), tuple(Ws), weights, converged
+    )
+
+
+def off_sq(off: np.ndarray) -> np.ndarray:
+    return off**2
+
+
+def _offset(x: np.ndarray, center: np.ndarray, m: int) -> np.ndarray:
+    return np.concatenate([x[: m + 1] - center, np.zeros(len(x) - m - 1)])
+
+
+def _clip_effects(model: Model, step: np.ndarray) -> np.ndarray:
+    """Logarithmic coordinates move by at most a factor e^1.5 in a step."""
+    log = np.array([q.log for e in model.effects for q in e.hypothesis.parameters], bool)
+    return np.where(log, np.clip(step, -1.5, 1.5), step) if len(step) else step
+
+
+def _cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
+    return float(
+        sum(
+            np.sum(weights.apply(g, residual(group, pred)) ** 2)
+            for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
+        )
+    )
+
+
+def _normal(
+    problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights
+) -> tuple[np.ndarray, np.ndarray]:
+    H, b = 0.0, 0.0
+    for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
+        J = weights.apply(g, observe_columns(group, jacobian(problem, model, group, pred)))
+        r = weights.apply(g, residual(group, pred))
+        J = J.reshape(-1, J.shape[-1])
+        H = H + J.T @ J
+        b = b + J.T @ r.ravel()
+    return H, b
+
+
+def observe_columns(group: Group, X: np.ndarray) -> np.ndarray:
+    """``Group.observe`` for (S, L, n, p)."""
+    if group.window is None:
+        return X[:, group.keep]
+    S, L, n, p = X.shape
+    out = group.observe(X.reshape(S, L, n * p))
+    return out.reshape(S, -1, n, p)
