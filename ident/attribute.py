@@ -26,7 +26,10 @@ DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not wort
 REFITS = 8  # candidates refitted in a round
 PER_EFFECT = 2  # of one effect, at most
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
-TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share model error
+TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
+MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
+NATS_PER_PARAMETER = 2.0
+DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 MIN_SHARE = 0.02  # share of the discrepancy that a cause must explain
 
@@ -155,7 +158,7 @@ def attribute_once(
         return Round(current, (), tuple(scores), 1.0)
     best_cost = min(c.fit.cost for c in candidates)
     scale = max(1.0, best_cost / current.count)
-    weighed = weigh(candidates, scale, current.count)
+    weighed = weigh(candidates, current.count)
     return Round(current, tuple(weighed), tuple(scores), scale)
 
 
@@ -180,15 +183,21 @@ def clip_to_bounds(score: Score) -> np.ndarray:
     )
 
 
-def weigh(candidates: Sequence[Candidate], scale: float, count: int) -> list[Candidate]:
-    """Probabilities from tempered evidence: cost and number of parameters (BIC), best first."""
-    evidence = np.array(
-        [
-            -0.5 * c.fit.cost / scale - 0.5 * sum(not q.nuisance for q in c.hypothesis.parameters) * np.log(count)
-            for c in candidates
-        ]
-    )
-    evidence = (evidence - evidence.max()) / TEMPER
+def weigh(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+    """Probabilities of refitted hypotheses, best first.
+
+    Under pure noise the evidence is half the difference of the costs. What the best model leaves
+    above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
+    difference counts only against ``TEMPER + MODEL_ERROR_SHARE x excess``. Parameters cost
+    ``NATS_PER_PARAMETER`` each, so that of two names for the same torque the simpler one wins.
+    """
+    cost = np.array([c.fit.cost for c in candidates])
+    excess = max(cost.min() - count, 0.0)
+    complexity = np.array([sum(not q.nuisance for q in c.hypothesis.parameters) for c in candidates])
+    decoy = np.array([c.hypothesis.decoy for c in candidates], float)
+    evidence = -0.5 * (cost - cost.min()) / (TEMPER + MODEL_ERROR_SHARE / 6.0 * excess)
+    evidence = evidence - NATS_PER_PARAMETER * complexity - DECOY_NATS * decoy
+    evidence -= evidence.max()
     probability = np.exp(evidence) / np.exp(evidence).sum()
     out = [
         replace(c, log_evidence=float(e), probability=float(p))

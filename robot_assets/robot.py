@@ -255,3 +255,11 @@ def _limits(urdf: Path) -> dict[str, tuple[float, float]]:
                 low, high = -np.pi, np.pi
             out[str(joint.get("name"))] = (low, high)
     return out
+
+
+def moving_links(robot: Robot) -> list[str]:
+    """Links that a driven joint carries directly: one per joint."""
+    by_joint = {
+        str(j.get("name")): str(j.find("child").get("link")) for j in _root(robot.urdf).findall("joint")
+    }
+    return [by_joint[name] for name in robot.joint_names]

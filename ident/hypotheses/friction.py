@@ -61,7 +61,8 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         v = motion.v(j)
-        return direction(v, p[3]) * (p[0] + (p[1] - p[0]) * np.exp(-((v / p[2]) ** 2)))
+        dip = max(p[1] - p[0], 0.1 * p[0])
+        return direction(v, p[3]) * (p[0] + dip * np.exp(-((v / p[2]) ** 2)))
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)

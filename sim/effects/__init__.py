@@ -1,0 +1,177 @@
+"""The catalogue of effects as what really happens in the plant."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from robot_assets.errors import DataError
+from robot_assets.robot import Robot
+from sim.effects import drive, friction, sensing, structure, transmission
+
+_CLASSES = (
+    friction.CoulombFriction,
+    friction.StribeckFriction,
+    friction.PreslidingFriction,
+    friction.LoadDependentFriction,
+    friction.FrictionDrift,
+    drive.Cogging,
+    drive.TorqueConstant,
+    drive.TorqueLag,
+    drive.TorqueDelay,
+    drive.TorqueSaturation,
+    transmission.HardeningStiffness,
+    transmission.SofteningStiffness,
+    transmission.Backlash,
+    transmission.Hysteresis,
+    transmission.TransmissionError,
+    transmission.JointCoupling,
+    structure.Payload,
+    structure.LinkInertia,
+    structure.TransverseElasticity,
+    structure.BaseElasticity,
+    structure.GravitySpring,
+    structure.DressPack,
+    sensing.EncoderEccentricity,
+    sensing.EncoderQuantization,
+    sensing.SensorDelay,
+    sensing.SensorLag,
+)
+EFFECTS = {c.name: c for c in _CLASSES}
+
+
+def parameters_of(effect: object) -> dict[str, object]:
+    """Parameters of an effect by their catalogue names."""
+    return {
+        f.name.rstrip("_"): getattr(effect, f.name)
+        for f in dataclasses.fields(effect)
+        if f.name != "place"
+    }
+
+
+def make_effect(name: str, place: str, **values: object) -> object:
+    """An effect from its catalogue name, place and parameters.
+
+    Raises:
+        DataError: for a name, place or parameter that there is not.
+    """
+    if name not in EFFECTS:
+        raise DataError("effect", name, "no such effect", f"one of {sorted(EFFECTS)}")
+    cls = EFFECTS[name]
+    fields = {f.name.rstrip("_"): f for f in dataclasses.fields(cls) if f.name != "place"}
+    for key in values:
+        if key not in fields:
+            raise DataError(f"effect {name}", place, f"parameter {key}", f"one of {list(fields)}")
+    required = [
+        k for k, f in fields.items() if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    ]
+    missing = [k for k in required if k not in values]
+    if missing:
+        raise DataError(f"effect {name}", place, f"no {missing[0]}", f"{required}")
+    return cls(place=place, **{fields[k].name: v for k, v in values.items()})
+
+
+def parse_effect(text: str, robot: Robot) -> object:
+    """An effect from ``NAME@PLACE:key=value,...``; sizes of ``draw_effect`` where no key is given.
+
+    Raises:
+        DataError: where the text is of another form or names what there is not.
+    """
+    match = re.fullmatch(r"([a-z_]+)@([^:]+)(?::(.*))?", text.strip())
+    if match is None:
+        raise DataError("effect", text, "another form", "NAME@PLACE:key=value,...")
+    name, place, rest = match.groups()
+    if name not in EFFECTS:
+        raise DataError("effect", text, name, f"one of {sorted(EFFECTS)}")
+    places = valid_places(name, robot)
+    if place not in places:
+        raise DataError("place", text, place, f"one of {places}")
+    values: dict[str, object] = {}
+    for item in filter(None, (rest or "").split(",")):
+        key, _, value = item.partition("=")
+        values[key.strip()] = _value(key.strip(), value.strip(), text)
+    if not values:
+        return draw_effect(np.random.default_rng(0), robot, names=(name,), place=place)
+    return make_effect(name, place, **values)
+
+
+def valid_places(name: str, robot: Robot) -> list[str]:
+    """Where an effect can sit on an arm."""
+    if name == "payload":
+        return ["flange"]
+    if name == "base_elasticity":
+        return ["base"]
+    if name == "link_inertia":
+        from robot_assets.robot import moving_links
+
+        return moving_links(robot)
+    if name == "joint_coupling":
+        return list(robot.joint_names[:-1])
+    return list(robot.joint_names)
+
+
+def _value(key: str, text: str, where: str) -> object:
+    if key == "channel":
+        return text
+    try:
+        numbers = tuple(float(v) for v in text.split())
+    except ValueError as err:
+        raise DataError(f"parameter {key}", where, repr(text), "a number, or three with spaces") from err
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def draw_effect(
+    rng: np.random.Generator,
+    robot: Robot,
+    *,
+    names: Sequence[str] | None = None,
+    strength: float = 1.0,
+    place: str | None = None,
+) -> object:
+    """An effect of random kind, place and size, clearly seen in an experiment of default size.
+
+    Args:
+        strength: factor on the size.
+    """
+    name = str(rng.choice(list(names or EFFECTS)))
+    place = place or str(rng.choice(valid_places(name, robot)))
+    joint = robot.joints[robot.joint_names.index(place)] if place in robot.joint_names else robot.joints[0]
+    size = strength * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
+    torque = 0.02 * joint.torque_limit * size
+    delta = 0.05 * joint.torque_limit / joint.stiffness
+    phase = float(rng.uniform(-np.pi, np.pi))
+    side = rng.permutation(np.eye(3))[0]
+    periods = float(rng.choice([2.0, 4.0])) * joint.gear_ratio / float(rng.choice([1.0, 2.0]))
+    k = joint.stiffness
+    draws: dict[str, dict[str, object]] = {
+        "coulomb_friction": {"torque": torque, "asymmetry": float(rng.uniform(-0.2, 0.2))},
+        "stribeck_friction": {"coulomb": torque, "static": 2 * torque, "stribeck_velocity": 0.03},
+        "presliding_friction": {"stiffness": torque / 2e-3, "coulomb": torque},
+        "load_dependent_friction": {"coefficient": 0.05 * size},
+        "friction_drift": {"relative_change": -min(0.3 * size, 0.8), "time_constant": 60.0, "coulomb": torque},
+        "cogging": {"amplitude": 0.5 * torque, "periods_per_rev": periods, "phase": phase},
+        "torque_constant": {"scale": 1 + 0.08 * size * float(rng.choice([-1, 1]))},
+        "torque_lag": {"time_constant": 1e-3 * size},
+        "torque_delay": {"delay": 1e-3 * size},
+        "torque_saturation": {"limit": 0.2 * joint.torque_limit / size},
+        "hardening_stiffness": {"cubic": 0.3 * size * k / delta**2},
+        "softening_stiffness": {"low_stiffness": k / (1 + size), "transition": delta},
+        "backlash": {"gap": delta * size},
+        "hysteresis": {"stiffness": 0.3 * k, "yield_torque": torque},
+        "transmission_error": {"amplitude": 0.3 * torque / k, "periods_per_rev": periods, "phase": phase},
+        "joint_coupling": {"ratio": 0.1 * size},
+        "payload": {"mass": 1.5 * size, "com_x": 0.02, "com_y": 0.0, "com_z": 0.08},
+        "link_inertia": {"mass": 1 + 0.15 * size, "inertia": 1 + 0.15 * size},
+        "transverse_elasticity": {"stiffness": 0.7 * k / size, "damping": 6e-4 * k, "axis": tuple(float(v) for v in side)},
+        "base_elasticity": {"stiffness": 10 * k / size, "damping": 6e-3 * k, "axis": (1.0, 0.0, 0.0)},
+        "gravity_spring": {"stiffness": 0.1 * joint.torque_limit * size, "rest_angle": float(rng.uniform(-1, 1))},
+        "dress_pack": {"stiffness": 0.1 * joint.torque_limit * size, "friction": 0.3 * torque},
+        "encoder_eccentricity": {"amplitude": 4e-3 * size, "phase": phase},
+        "encoder_quantization": {"resolution": 4e-5 * size},
+        "sensor_delay": {"delay": 1e-3 * size},
+        "sensor_lag": {"time_constant": 1e-3 * size},
+    }
+    return make_effect(name, place, **draws[name])

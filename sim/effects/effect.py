@@ -1,0 +1,61 @@
+"""What an effect of the plant may do, and the state it sees.
+
+An effect is a frozen dataclass with ``name``, ``place`` and the parameters of the catalogue. It
+may define any of:
+
+    hinges() -> sequence of Elasticity           extra hinges of the chain
+    edit(spec, robot, drives)                    native MuJoCo elements
+    torque(run) -> step(State) -> Torque         a torque at every integration step
+    deliver(run) -> step(u, State) -> u          what becomes of the commanded torque
+    measure(run) -> step(State) -> (S,) rad      what the encoder shows of its joint
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robot_assets.robot import Robot
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: number of simulations S, integration step h (s), sample time (s), start times (S,)."""
+
+    simulations: int
+    step: float
+    sample_time: float
+    robot: Robot
+    drives: dict[str, np.ndarray]
+    start: np.ndarray
+
+    def joint(self, name: str) -> int:
+        return self.robot.joint_names.index(name)
+
+
+@dataclass(frozen=True)
+class State:
+    """State of all simulations in the middle of the coming integration step, each (S, n).
+
+    Positions and velocities are extrapolated by half a step, so that a torque held over the step
+    has no delay to first order. ``now_*`` are the values at its start.
+    """
+
+    time: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    q_link: np.ndarray
+    v_link: np.ndarray
+    now_q: np.ndarray
+    now_v: np.ndarray
+    now_q_link: np.ndarray
+
+
+@dataclass(frozen=True)
+class Torque:
+    """Torques (S,) of one joint on its motor and on its link, N m."""
+
+    joint: int
+    motor: np.ndarray | float = 0.0
+    link: np.ndarray | float = 0.0

@@ -1,0 +1,107 @@
+"""Effects of the chain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from robot_assets.robot import Elasticity, Robot
+from sim.effects.effect import Run, State, Torque
+from sim.effects.friction import smooth_sign
+
+
+@dataclass(frozen=True)
+class Payload:
+    """Unknown point load in the frame of the flange's link."""
+
+    mass: float
+    com_x: float = 0.0
+    com_y: float = 0.0
+    com_z: float = 0.0
+    place: str = "flange"
+    name = "payload"
+
+    def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
+        part = spec.body(f"body:{robot.payload_link}").add_body(name="payload")
+        part.explicitinertial = True
+        part.mass = self.mass
+        part.ipos = [self.com_x, self.com_y, self.com_z]
+        part.inertia = [1e-9] * 3
+
+
+@dataclass(frozen=True)
+class LinkInertia:
+    """Mass and inertia of a link are multiples of those of its description."""
+
+    place: str
+    mass: float = 1.0
+    inertia: float = 1.0
+    name = "link_inertia"
+
+    def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
+        body = spec.body(f"body:{self.place}")
+        body.mass = float(body.mass) * self.mass
+        body.inertia = np.asarray(body.inertia) * self.inertia
+
+
+@dataclass(frozen=True)
+class TransverseElasticity:
+    """A spring-damper hinge across a joint."""
+
+    place: str
+    stiffness: float
+    damping: float
+    axis: tuple[float, float, float]
+    name = "transverse_elasticity"
+
+    def hinges(self) -> tuple[Elasticity, ...]:
+        return (Elasticity(f"hidden:{self.place}", self.place, self.axis, self.stiffness, self.damping),)
+
+
+@dataclass(frozen=True)
+class BaseElasticity:
+    """The foundation turns on a spring-damper."""
+
+    stiffness: float
+    damping: float
+    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    place: str = "base"
+    name = "base_elasticity"
+
+    def hinges(self) -> tuple[Elasticity, ...]:
+        return (Elasticity("hidden:base", "base", self.axis, self.stiffness, self.damping),)
+
+
+@dataclass(frozen=True)
+class GravitySpring:
+    """Balancing spring on the link."""
+
+    place: str
+    stiffness: float
+    rest_angle: float = 0.0
+    name = "gravity_spring"
+
+    def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
+        joint = spec.joint(f"link:{self.place}")
+        joint.stiffness = [self.stiffness, 0, 0]
+        joint.springref = self.rest_angle
+
+
+@dataclass(frozen=True)
+class DressPack:
+    """Cable bundle on the link: a spring about zero and friction."""
+
+    place: str
+    stiffness: float
+    friction: float
+    name = "dress_pack"
+
+    def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
+        spec.joint(f"link:{self.place}").stiffness = [self.stiffness, 0, 0]
+
+    def torque(self, run: Run) -> Callable[[State], Torque]:
+        j = run.joint(self.place)
+        return lambda x: Torque(j, 0.0, -self.friction * smooth_sign(x.v_link[:, j]))

@@ -1,0 +1,269 @@
+"""Robot and effects to a compiled MuJoCo model.
+
+Every driven joint is a hinge of the chain (``link:<joint>``) and a rotor beside the chain
+(``motor:<joint>``) that turns about its own axis only; a fixed tendon of length
+``q_motor - q_link`` is the gear: its native stiffness and damping act on both.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robot_assets.errors import DataError
+from robot_assets.robot import Elasticity, Robot
+
+DRIVE_FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A compiled arm and where its coordinates stand.
+
+    Attributes:
+        model: MuJoCo model.
+        motor, link: (n,) addresses of motor and link coordinates in qpos and qvel alike.
+        hinges: (n_e,) addresses of the elastic hinges.
+        drives: the true drive figures, each (n,).
+        effects: what is hidden in it.
+    """
+
+    model: mujoco.MjModel
+    motor: np.ndarray
+    link: np.ndarray
+    hinges: np.ndarray
+    drives: dict[str, np.ndarray]
+    robot: Robot
+    effects: tuple
+
+    def tendon(self, joint: int) -> int:
+        """Id of a joint's gear."""
+        return self.model.tendon(f"gear:{self.robot.joint_names[joint]}").id
+
+
+def build_plant(
+    robot: Robot,
+    effects: Sequence = (),
+    *,
+    drives: dict[str, np.ndarray] | None = None,
+    timestep: float = 2.5e-4,
+    integrator: str = "RK4",
+) -> Plant:
+    """Compile an arm.
+
+    Args:
+        drives: true values of ``DRIVE_FIELDS``, each (n,); nominal where absent.
+        timestep: s. integrator: of ``mujoco.mjtIntegrator``.
+    """
+    figures = {f: robot.array(f) for f in DRIVE_FIELDS} | dict(drives or {})
+    spec = mujoco.MjSpec()
+    spec.option.timestep = timestep
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    spec.option.gravity = list(robot.gravity)
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    hinges = list(robot.elasticities)
+    for effect in effects:
+        hinges += getattr(effect, "hinges", lambda: ())()
+    _add_chain(spec, robot, hinges)
+    for j, joint in enumerate(robot.joints):
+        _add_drive(spec, joint.name, {f: figures[f][j] for f in DRIVE_FIELDS})
+    for effect in effects:
+        edit = getattr(effect, "edit", None)
+        if edit is not None:
+            edit(spec, robot, figures)
+    model = spec.compile()
+
+    def address(name: str) -> int:
+        return int(model.joint(name).qposadr[0])
+
+    return Plant(
+        model=model,
+        motor=np.array([address(f"motor:{name}") for name in robot.joint_names]),
+        link=np.array([address(f"link:{name}") for name in robot.joint_names]),
+        hinges=np.array([address(f"hinge:{h.name}") for h in hinges], int),
+        drives=figures,
+        robot=robot,
+        effects=tuple(effects),
+    )
+
+
+def link_inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:
+    """(n,) inertia that each motor moves in a posture with stiff gears, its own included, kg m2."""
+    data = mujoco.MjData(plant.model)
+    data.qpos[plant.link] = q
+    mujoco.mj_forward(plant.model, data)
+    M = np.zeros((plant.model.nv, plant.model.nv))
+    mujoco.mj_fullM(plant.model, data, M)
+    return np.diag(M)[plant.link] + plant.drives["motor_inertia"]
+
+
+def gravity_torque(plant: Plant, q: np.ndarray) -> np.ndarray:
+    """(n,) torque that holds the links at rest in a posture, stiff gears, N m."""
+    data = mujoco.MjData(plant.model)
+    data.qpos[plant.link] = q
+    data.qpos[plant.motor] = q
+    mujoco.mj_forward(plant.model, data)
+    return (data.qfrc_bias - data.qfrc_passive)[plant.link]
+
+
+def rest(plant: Plant, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """State at rest with the motors at ``q`` (n,): (qpos, holding torque at the motors).
+
+    Newton on the passive and bias forces, by differences: the gears may be nonlinear.
+    """
+    model, data = plant.model, mujoco.MjData(plant.model)
+    free = np.concatenate([plant.link, plant.hinges]).astype(int)
+    x = np.zeros(model.nq)
+    x[plant.motor] = q
+    x[plant.link] = q
+
+    def force(x: np.ndarray) -> np.ndarray:
+        data.qpos[:] = x
+        data.qvel[:] = 0.0
+        mujoco.mj_forward(model, data)
+        return data.qfrc_passive - data.qfrc_bias
+
+    for _ in range(60):
+        f = force(x)[free]
+        J = np.empty((len(free), len(free)))
+        for c, k in enumerate(free):
+            moved = x.copy()
+            moved[k] += 1e-7
+            J[:, c] = (force(moved)[free] - f) / 1e-7
+        step = np.linalg.lstsq(J, -f, rcond=1e-12)[0]
+        x[free] += np.clip(step, -0.05, 0.05)
+        if np.abs(step).max() < 1e-12:
+            break
+    return x, -force(x)[plant.motor]
+
+
+def _add_drive(spec: mujoco.MjSpec, name: str, figures: dict[str, float]) -> None:
+    rotor = spec.worldbody.add_body(name=f"rotor:{name}")
+    rotor.explicitinertial = True
+    rotor.mass, rotor.inertia = 1e-6, [1e-10] * 3
+    rotor.add_joint(
+        name=f"motor:{name}",
+        axis=[0, 0, 1],
+        armature=float(figures["motor_inertia"]),
+        damping=[float(figures["viscous_friction"]), 0, 0],
+    )
+    gear = spec.add_tendon(name=f"gear:{name}")
+    gear.wrap_joint(f"motor:{name}", 1.0)
+    gear.wrap_joint(f"link:{name}", -1.0)
+    gear.stiffness = [float(figures["stiffness"]), 0, 0]
+    gear.damping = [float(figures["damping"]), 0, 0]
+    gear.springlength = [0, 0]
+
+
+def _add_chain(spec: mujoco.MjSpec, robot: Robot, hinges: Sequence[Elasticity]) -> None:
+    root = ET.parse(robot.urdf).getroot()
+    links = {e.get("name"): e for e in root.findall("link")}
+    joints = root.findall("joint")
+    children: dict[str, list[ET.Element]] = {}
+    for joint in joints:
+        children.setdefault(joint.find("parent").get("link"), []).append(joint)
+    base = set(links) - {j.find("child").get("link") for j in joints}
+    loads: dict[str, list] = {}
+    for load in robot.loads:
+        loads.setdefault(load.link, []).append(load)
+
+    def add(body: mujoco.MjsBody, link: str) -> None:
+        _set_inertia(body, links[link])
+        for i, load in enumerate(loads.get(link, [])):
+            _add_mass(body, f"load:{link}:{i}", load.mass, load.com, load.inertia)
+        for joint in children.get(link, []):
+            name, kind = joint.get("name"), joint.get("type")
+            child = joint.find("child").get("link")
+            R, p = _origin(joint)
+            axis = _numbers(joint.find("axis"), "xyz", "1 0 0")
+            if kind != "fixed" and name not in robot.joint_names:
+                if name not in robot.locked:
+                    raise DataError("joint", str(robot.folder), f"{name} neither driven nor locked", "a [locked] entry")
+                value = robot.locked[name]
+                if kind == "prismatic":
+                    p = p + R.apply(axis * value)
+                else:
+                    R = R * Rotation.from_rotvec(axis / np.linalg.norm(axis) * value)
+            part = body.add_body(name=f"body:{child}", pos=p, quat=_quat(R))
+            if name in robot.joint_names:
+                slide = kind == "prismatic"
+                part.add_joint(
+                    name=f"link:{name}",
+                    axis=axis,
+                    type=mujoco.mjtJoint.mjJNT_SLIDE if slide else mujoco.mjtJoint.mjJNT_HINGE,
+                )
+                _add_hinges(part, name, hinges)
+            add(part, child)
+
+    bottom = spec.worldbody
+    if any(h.joint == "base" for h in hinges):
+        bottom = spec.worldbody.add_body(name="base")
+        _add_hinges(bottom, "base", hinges)
+    for link in sorted(base):
+        if bottom is spec.worldbody:
+            part = bottom.add_body(name=f"body:{link}")
+        else:
+            part = bottom.add_body(name=f"body:{link}")
+        add(part, link)
+
+
+def _add_hinges(body: mujoco.MjsBody, joint: str, hinges: Sequence[Elasticity]) -> None:
+    for h in hinges:
+        if h.joint == joint:
+            body.add_joint(
+                name=f"hinge:{h.name}",
+                axis=list(h.axis),
+                stiffness=[h.stiffness, 0, 0],
+                damping=[h.damping, 0, 0],
+            )
+
+
+def _set_inertia(body: mujoco.MjsBody, link: ET.Element) -> None:
+    inertial = link.find("inertial")
+    body.explicitinertial = True
+    if inertial is None:
+        body.mass, body.inertia = 1e-9, [1e-12] * 3
+        return
+    R, p = _origin(inertial)
+    I = inertial.find("inertia")
+    ixx, ixy, ixz, iyy, iyz, izz = (float(I.get(k, 0)) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+    tensor = R.as_matrix() @ np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ R.as_matrix().T
+    _put_inertia(body, float(inertial.find("mass").get("value")), p, tensor)
+
+
+def _put_inertia(body: mujoco.MjsBody, mass: float, com: np.ndarray, tensor: np.ndarray) -> None:
+    values, axes = np.linalg.eigh(tensor)
+    if np.linalg.det(axes) < 0:
+        axes = axes * np.array([1, 1, -1])
+    body.explicitinertial = True
+    body.mass = max(mass, 1e-9)
+    body.ipos = com
+    body.iquat = _quat(Rotation.from_matrix(axes))
+    body.inertia = np.maximum(values, 1e-12)
+
+
+def _add_mass(body: mujoco.MjsBody, name: str, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
+    part = body.add_body(name=name)
+    _put_inertia(part, mass, np.asarray(com, float), np.asarray(inertia, float))
+
+
+def _origin(element: ET.Element) -> tuple[Rotation, np.ndarray]:
+    origin = element.find("origin")
+    if origin is None:
+        return Rotation.identity(), np.zeros(3)
+    return Rotation.from_euler("xyz", _numbers(origin, "rpy", "0 0 0")), _numbers(origin, "xyz", "0 0 0")
+
+
+def _numbers(element: ET.Element | None, key: str, default: str) -> np.ndarray:
+    text = default if element is None else element.get(key, default)
+    return np.array([float(v) for v in text.split()])
+
+
+def _quat(R: Rotation) -> np.ndarray:
+    x, y, z, w = R.as_quat()
+    return np.array([w, x, y, z])
