@@ -1,0 +1,211 @@
+"""Results: what the simulation gets wrong, where, how sure, and what the extension gains."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robot_assets.robot import Robot
+
+SCHEMA = "simgap-verdict/1"
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter with its standard deviation, SI."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Alternative:
+    effect: str
+    joint: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A named effect at a place ("flange" and "base" are places too)."""
+
+    effect: str
+    joint: str
+    parameters: dict[str, Value]
+    probability: float
+    evidence: str
+    alternatives: tuple[Alternative, ...]
+
+
+@dataclass(frozen=True)
+class Where:
+    """A share of the discrepancy: joint, signal and kind of line."""
+
+    joint: str
+    signal: str
+    feature: str
+    share: float
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    detected: bool
+    p_value: float
+    chi2_per_dof: float
+    where: tuple[Where, ...]
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Prediction error on held-out segments before and after, N m."""
+
+    segments: tuple[str, ...]
+    metric: str
+    before: float
+    after: float
+    noise_floor: float
+    gap_closed: float | None
+    ci95: tuple[float, float] | None
+    method: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The result of a diagnosis; ``to_dict`` is the contract of verdict.json."""
+
+    dataset: str
+    baseline: dict[str, Value]
+    discrepancy: Discrepancy
+    causes: tuple[Cause, ...]
+    unexplained_share: float
+    unexplained_verdict: str
+    gain: Gain | None
+    next_experiment: str | None
+    sentence: str
+    unidentified: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    residual_description: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready, plain SI numbers."""
+        out = {
+            "schema": SCHEMA,
+            "dataset": self.dataset,
+            "sentence": self.sentence,
+            "baseline": {
+                "parameters": {k: asdict(v) for k, v in self.baseline.items()},
+                "not_identified": list(self.unidentified),
+            },
+            "discrepancy": asdict(self.discrepancy),
+            "causes": [asdict(c) for c in self.causes],
+            "unexplained": {
+                "share": self.unexplained_share,
+                "verdict": self.unexplained_verdict,
+                "description": self.residual_description,
+            },
+            "gain": None if self.gain is None else asdict(self.gain),
+            "next_experiment": self.next_experiment,
+            "notes": list(self.notes),
+        }
+        return _plain(out)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``verdict.json`` into a folder; an earlier one stands until the new one is whole."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(self.to_dict(), indent=2, allow_nan=False)
+        handle, name = tempfile.mkstemp(prefix=".verdict-", dir=folder)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text + "\n")
+        os.chmod(name, 0o644)
+        os.replace(name, folder / "verdict.json")
+        return folder / "verdict.json"
+
+
+@dataclass(frozen=True)
+class SpectrumMap:
+    """Rms torque residual, N m: (Q, n, B) per operating point, joint and band."""
+
+    band_edges_hz: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    noise: np.ndarray
+    operating_points: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EvidencePlot:
+    """Residual torque against the variable that explains it, and the fitted law."""
+
+    cause: int
+    title: str
+    x_label: str
+    y_label: str
+    x: np.ndarray
+    y: np.ndarray
+    model_x: np.ndarray
+    model_y: np.ndarray
+
+
+@dataclass(frozen=True)
+class TorqueTrace:
+    """Motor torque along a motion: (N, n) measured and predicted, and the motor position."""
+
+    segment: str
+    t: np.ndarray
+    measured: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    q: np.ndarray
+
+
+@dataclass(frozen=True)
+class FrfView:
+    """Motor torque to motor acceleration at an operating point, (rad/s2)/(N m)."""
+
+    operating_point: str
+    frequency: np.ndarray
+    measured: np.ndarray
+    measured_std: np.ndarray
+    baseline: np.ndarray
+    extended: np.ndarray
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything a report or recording shows."""
+
+    verdict: Verdict
+    robot: Robot
+    joints: tuple[str, ...]
+    frf: tuple[FrfView, ...]
+    spectrum: SpectrumMap | None
+    evidence: tuple[EvidencePlot, ...]
+    traces: tuple[TorqueTrace, ...]
+    parameters: dict[str, float]
+    seconds: float
+    candidates: tuple[tuple[tuple[str, str, float], ...], ...] = field(default=())
+
+
+def _plain(x: Any) -> Any:
+    """NumPy numbers to Python ones; numbers that JSON lacks to null."""
+    if isinstance(x, dict):
+        return {str(k): _plain(v) for k, v in x.items()}
+    if isinstance(x, list | tuple):
+        return [_plain(v) for v in x]
+    if isinstance(x, np.ndarray):
+        return [_plain(v) for v in x.tolist()]
+    if isinstance(x, np.bool_):
+        return bool(x)
+    if isinstance(x, np.integer):
+        return int(x)
+    if isinstance(x, float | np.floating):
+        return float(x) if np.isfinite(x) else None
+    return x
