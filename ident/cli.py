@@ -1,0 +1,327 @@
+"""The command line: thin. Results to stdout, progress to stderr."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from robot_assets.errors import DataError
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, help="Find what a robot simulation gets wrong.")
+Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
+Out = Annotated[Path, typer.Option("--out", help="Where to write.")]
+
+
+def main() -> None:
+    """Run; bad input ends in one line on stderr and exit status 2."""
+    try:
+        app(standalone_mode=False)
+    except DataError as err:
+        sys.exit(_fail(str(err)))
+    except typer.Exit as err:
+        sys.exit(err.exit_code)
+    except (typer.Abort, KeyboardInterrupt):
+        sys.exit(_fail("interrupted"))
+    except Exception as err:
+        if type(err).__module__.startswith(("click", "typer")):
+            sys.exit(_fail(getattr(err, "format_message", lambda: str(err))()))
+        raise
+
+
+def _fail(text: str) -> int:
+    print("simgap: " + " ".join(text.split()), file=sys.stderr)
+    return 2
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Callable[[float], None]]]:
+    """Two reporters, of text and of a share done: a bar where stderr is a terminal."""
+    console = Console(stderr=True)
+    if quiet:
+        yield (lambda text: None), (lambda share: None)
+    elif console.is_terminal:
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console) as bar:
+            task = bar.add_task("", total=None)
+            yield (
+                lambda text: bar.update(task, description=text),
+                lambda share: bar.update(task, total=1.0, completed=share),
+            )
+    else:
+        last = [-1]
+
+        def share(done: float) -> None:
+            if int(done * 10) > last[0]:
+                last[0] = int(done * 10)
+                print(f"simulated {done:.0%}", file=sys.stderr)
+
+        yield (lambda text: print(text, file=sys.stderr)), share
+
+
+def _robot(name: str):
+    from robot_assets.robot import load_robot
+
+    return load_robot(name)
+
+
+def _plan(robot, points: int, realizations: int, seed: int, levels: tuple[float, ...]):
+    import numpy as np
+
+    from ident.excitation import make_plan, operating_points
+    from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+
+    plant = build_plant(robot)
+    postures = operating_points(robot, points + 1, np.random.default_rng(seed))
+    return make_plan(
+        robot,
+        points=points,
+        realizations=realizations,
+        levels=levels,
+        seed=seed,
+        postures=postures,
+        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
+        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
+    )
+
+
+@app.command()
+def experiment(
+    robot: str,
+    out: Out,
+    effect: Annotated[list[str] | None, typer.Option("--effect", help="NAME@PLACE:key=value,...; several hide several.")] = None,
+    seed: Annotated[int, typer.Option(help="Of excitation, noise and drives.")] = 0,
+    realizations: Annotated[int, typer.Option(min=1)] = 1,
+    points: Annotated[int, typer.Option(min=1, help="Operating points for identification.")] = 2,
+    drives: Annotated[str, typer.Option(help='"nominal", or "drawn" within a factor of two.')] = "nominal",
+    plan: Annotated[Path | None, typer.Option(help="A plan written by `simgap design`.")] = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run the closed-loop multisine experiment on the MuJoCo plant and write a dataset."""
+    import numpy as np
+
+    from ident.dataset_io import save_dataset
+    from ident.excitation import plan_from_toml
+    from sim import parse_effect, run_experiment
+    from sim.experiment import draw_drives
+
+    arm = _robot(robot)
+    if drives not in ("nominal", "drawn"):
+        raise DataError("--drives", "command line", drives, '"nominal" or "drawn"')
+    hidden = [parse_effect(text, arm) for text in effect or []]
+    figures = draw_drives(np.random.default_rng(seed + 1000), arm) if drives == "drawn" else None
+    made = plan_from_toml(plan) if plan else _plan(arm, points, realizations, seed, (1.0, 0.5, 0.25))
+    with _progress(quiet or json_) as (_, share):
+        data = run_experiment(made, hidden, seed=seed, drives=figures, name=out.name, progress=share)
+    save_dataset(data, out)
+    _print({"dataset": str(out), "segments": len(data.segments)}, json_, f"{len(data.segments)} segments in {out}")
+
+
+@app.command()
+def check(dataset: Path, json_: Json = False, quiet: Quiet = False) -> None:
+    """Validate a dataset and print what it holds."""
+    from ident.checking import inspect_dataset
+    from ident.dataset_io import load_dataset
+
+    report = inspect_dataset(load_dataset(dataset))
+    _print(report.to_dict(), json_, report.text())
+
+
+@app.command()
+def frf(dataset: Path, out: Out, json_: Json = False, quiet: Quiet = False) -> None:
+    """Nonparametric FRFs, covariances and nonlinear distortion levels."""
+    from ident.dataset_io import load_dataset
+    from ident.frf_output import write_frf
+
+    summary = write_frf(load_dataset(dataset), out)
+    _print(summary, json_, f"FRFs of {len(summary['operating_points'])} operating points in {out}")
+
+
+@app.command()
+def identify(
+    dataset: Path,
+    out: Out,
+    estimator: Annotated[str, typer.Option(help="wlls, lls, wnls, nls (FRF), or ml (torque residual).")] = "wlls",
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Gray-box parameters with standard deviations and correlations."""
+    from ident.dataset_io import load_dataset
+    from ident.identify_output import identify_and_write
+
+    data = load_dataset(dataset)
+    with _progress(quiet or json_) as (say, _):
+        result = identify_and_write(data, out, estimator, say)
+    _print(result, json_, _parameter_table(result["parameters"]))
+
+
+@app.command()
+def diagnose(
+    dataset: Path,
+    out: Out,
+    max_causes: Annotated[int, typer.Option(min=0)] = 4,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Everything: verdict.json, report.html, recording.rrd, model.toml and model.xml."""
+    from ident.dataset_io import load_dataset
+    from ident.diagnose import diagnose_fully
+    from ident.show.outputs import write_outputs
+
+    data = load_dataset(dataset)
+    _check_out(out)
+    with _progress(quiet or json_) as (say, _):
+        result = diagnose_fully(data, max_causes=max_causes, progress=say)
+        say("writing report and recording")
+        write_outputs(result, out)
+    _print(result.verdict.to_dict(), json_, _verdict_text(result.verdict, out))
+
+
+@app.command()
+def demo(
+    out: Out,
+    seed: Annotated[int | None, typer.Option(help="Of the hidden effect and everything else; drawn where absent.")] = None,
+    real: Annotated[str | None, typer.Option(help="Diagnose shipped real data instead, by name.")] = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """A UR10 experiment with an effect drawn at random and hidden, and its diagnosis."""
+    import numpy as np
+
+    from ident.dataset_io import load_dataset, save_dataset
+    from ident.diagnose import diagnose_fully
+    from ident.show.outputs import write_outputs
+    from sim import draw_effect, run_experiment
+    from sim.effects import parameters_of
+    from sim.experiment import draw_drives
+
+    _check_out(out)
+    if real is not None:
+        return _demo_real(real, out, json_, quiet)
+    seed = int(np.random.SeedSequence().entropy % 100_000) if seed is None else seed
+    rng = np.random.default_rng(seed)
+    arm = _robot("ur10")
+    hidden = draw_effect(rng, arm, names=DEMO_EFFECTS)
+    figures = draw_drives(rng, arm)
+    with _progress(quiet or json_) as (say, share):
+        say(f"seed {seed}: simulating the plant with a hidden effect")
+        data = run_experiment(
+            _plan(arm, 2, 1, seed, (1.0, 0.5, 0.25)), [hidden], seed=seed, drives=figures, name=f"demo-{seed}", progress=share
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            save_dataset(data, Path(folder) / "dataset")
+            data = load_dataset(Path(folder) / "dataset")
+            result = diagnose_fully(data, progress=say)
+        say("writing report and recording")
+        write_outputs(result, out)
+    truth = {"effect": hidden.name, "place": hidden.place, "parameters": parameters_of(hidden)}
+    shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in truth["parameters"].items())
+    text = _verdict_text(result.verdict, out) + f"\nTruth (seed {seed}): {hidden.name} at {hidden.place}, {shown}"
+    _print({"seed": seed, "truth": truth, "verdict": result.verdict.to_dict()}, json_, text)
+
+
+DEMO_EFFECTS = (
+    "coulomb_friction",
+    "cogging",
+    "torque_constant",
+    "torque_delay",
+    "hardening_stiffness",
+    "payload",
+)
+
+
+def _demo_real(name: str, out: Path, json_: bool, quiet: bool) -> None:
+    from ident.dataset_io import load_dataset
+    from ident.diagnose import diagnose_fully
+    from ident.show.outputs import write_outputs
+
+    shipped = Path(__file__).parent / "real"
+    known = sorted(p.parent.name for p in shipped.glob("*/dataset.toml"))
+    if name not in known:
+        raise DataError("--real", "command line", name, f"one of {known}")
+    data = load_dataset(shipped / name)
+    with _progress(quiet or json_) as (say, _):
+        result = diagnose_fully(data, progress=say)
+        write_outputs(result, out)
+    _print(result.verdict.to_dict(), json_, _verdict_text(result.verdict, out))
+
+
+@app.command()
+def convert(
+    files: list[Path],
+    out: Out,
+    robot: Annotated[str, typer.Option(help="A name in robot_assets or a robot folder.")],
+    map_: Annotated[Path, typer.Option("--map", help="Which columns hold what.")],
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Real logs (CSV, Parquet, MATLAB, NPZ) into the dataset format."""
+    from ident.convert import convert_logs
+    from ident.dataset_io import save_dataset
+
+    data = convert_logs(files, robot, map_, name=out.name)
+    save_dataset(data, out)
+    _print({"dataset": str(out), "segments": len(data.segments)}, json_, f"{len(data.segments)} segments in {out}")
+
+
+@app.command()
+def show(folder: Path) -> None:
+    """Open the recording of a diagnosis in the rerun viewer."""
+    import subprocess
+
+    recording = folder / "recording.rrd"
+    if not recording.is_file():
+        raise DataError("recording", str(folder), "no recording.rrd", "the folder of `simgap diagnose`")
+    raise typer.Exit(subprocess.call([sys.executable, "-m", "rerun", str(recording)]))
+
+
+def _check_out(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise DataError("--out", str(out), "a file", "a folder")
+
+
+def _print(data: dict[str, Any], json_: bool, text: str) -> None:
+    print(json.dumps(data, indent=2) if json_ else text)
+
+
+def _verdict_text(verdict, out: Path) -> str:
+    lines = [verdict.sentence]
+    for cause in verdict.causes:
+        values = ", ".join(f"{k} {v.value:.4g} ± {v.std:.2g} {v.unit}" for k, v in cause.parameters.items())
+        lines.append(f"  {cause.effect} at {cause.joint}, probability {cause.probability:.3f}: {values}")
+        lines += [f"    or {a.effect} at {a.joint}, {a.probability:.3f}" for a in cause.alternatives]
+    if verdict.gain is not None:
+        g = verdict.gain
+        lines.append(f"Torque error on held-out data: {g.before:.4g} -> {g.after:.4g} N m, noise {g.noise_floor:.4g}")
+    lines.append(f"Unexplained: {verdict.unexplained_verdict} ({verdict.unexplained_share:.2%})")
+    if verdict.residual_description:
+        lines.append(verdict.residual_description)
+    if verdict.next_experiment:
+        lines.append(verdict.next_experiment)
+    return "\n".join([*lines, f"Report: {out / 'report.html'}"])
+
+
+def _parameter_table(parameters: dict[str, dict]) -> str:
+    table = Table("parameter", "value", "sigma", "sigma %", "unit")
+    for name, v in parameters.items():
+        share = 100 * v["std"] / abs(v["value"]) if v["value"] else float("nan")
+        table.add_row(name, f"{v['value']:.6g}", f"{v['std']:.2g}", f"{share:.2g}", v["unit"])
+    console = Console(width=100)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,306 @@
+"""The main job: data to verdict, each step one function."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.attribute import Attribution, Candidate, attribute, fit_baseline
+from ident.dataset import Dataset
+from ident.extended import Effect, Prediction, predict
+from ident.gain import measure_gain, segment_errors
+from ident.graybox import Parameters, build_structure, parameter_names, parameter_unit
+from ident.inverse import Sampling
+from ident.noise import difference_noise
+from ident.records import Group, build_groups
+from ident.reporting import describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
+from ident.torque_fit import Fit, Problem, fit
+from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict
+
+UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
+LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
+LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A problem with its held-out groups."""
+
+    problem: Problem
+    held_out: tuple[Group, ...]
+    names: tuple[str, ...]
+
+
+def set_up(dataset: Dataset) -> Setup:
+    """Records, structure and starting guesses of a dataset.
+
+    Raises:
+        DataError: where nothing is left for identification.
+    """
+    robot = dataset.robot
+    groups = build_groups(dataset)
+    multisines = tuple(g for g in groups if g.window is None)
+    held_out = ()
+    if any(s.role == "validation" for s in dataset.segments):
+        held_out = build_groups(dataset, role="validation")
+    q_std, tau_std = _noise(dataset)
+    nominal = Parameters.nominal(robot)
+    problem = Problem(
+        build_structure(robot),
+        multisines or groups,
+        Sampling(1.0 / dataset.sample_rate, dataset.input_hold),
+        nominal,
+        tau_std,
+        q_std,
+    )
+    return Setup(problem, held_out, parameter_names(robot))
+
+
+def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Sample noise of position and torque: as given, else from fourth differences of the data."""
+    out = []
+    for given, channel in ((dataset.q_std, "q"), (dataset.tau_std, "tau")):
+        if given is not None and np.all(given > 0):
+            out.append(np.asarray(given, float))
+        else:
+            each = np.stack([difference_noise(getattr(s, channel)) for s in dataset.segments])
+            floor = 1e-9 if channel == "q" else 1e-6
+            out.append(np.maximum(np.median(each, axis=0), floor))
+    return out[0], out[1]
+
+
+def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:
+    """Baseline parameters by maximum likelihood on the torque residual."""
+    setup = set_up(dataset)
+    return setup, fit_baseline(setup.problem, progress)
+
+
+def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:
+    """Baseline parameters with standard deviations, and those the data do not determine."""
+    m = len(result.model.par.to_log())
+    x = np.exp(result.model.par.to_log())
+    std = np.sqrt(np.maximum(np.diag(result.covariance())[:m], 0.0))
+    names = result.names[:m]
+    values = {n: Value(float(v), float(v * s), parameter_unit(n)) for n, v, s in zip(names, x, std, strict=True)}
+    return values, tuple(n for n, s in zip(names, std, strict=True) if not s < UNDETERMINED)
+
+
+def diagnose(
+    dataset: Dataset, *, max_causes: int = 4, progress: Callable[[str], None] | None = None
+) -> Verdict:
+    """Find what the simulation gets wrong; the verdict alone (see ``diagnose_fully``)."""
+    return diagnose_fully(dataset, max_causes=max_causes, progress=progress).verdict
+
+
+def diagnose_fully(
+    dataset: Dataset, *, max_causes: int = 4, progress: Callable[[str], None] | None = None
+) -> Diagnosis:
+    """Identification, attribution, extension and gain, with all that reports show."""
+    began = time.perf_counter()
+    say = progress or (lambda text: None)
+    setup, baseline = identify(dataset, progress=say)
+    problem = setup.problem
+    result = attribute(problem, baseline, max_causes=max_causes, progress=say)
+    say("gain on held-out data")
+    before, after = baseline.model, result.final.model
+    if setup.held_out:
+        errors, pairs = segment_errors(problem, setup.held_out, before, after)
+        gain = measure_gain(errors, dataset.n, "validation segments", np.random.default_rng(SEED))
+        shown = setup.held_out
+    else:
+        gain = leave_one_out(setup, result)
+        shown = problem.groups[:1]
+        pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
+    say("evidence")
+    first = [predict(before, g, problem.sampling, W=W, steps=0) for g, W in zip(problem.groups, baseline.remainders, strict=True)]
+    last = [predict(after, g, problem.sampling) for g in problem.groups]
+    verdict = make_verdict(dataset, setup, result, gain, first, last)
+    kept = result.rounds if len(verdict.causes) else ()
+    return Diagnosis(
+        verdict=verdict,
+        robot=dataset.robot,
+        joints=dataset.joints,
+        frf=frf_views(dataset, problem, before, after),
+        spectrum=spectrum_map(problem, baseline, first, last),
+        evidence=tuple(
+            evidence_plot(problem, result.final, last, i) for i in range(min(len(kept), len(after.effects)))
+        ),
+        traces=torque_traces(dataset, shown, pairs),
+        parameters={k: v.value for k, v in baseline_values(result.final)[0].items()},
+        seconds=time.perf_counter() - began,
+        candidates=tuple(
+            tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
+        ),
+    )
+
+
+def leave_one_out(setup: Setup, result: Attribution) -> Gain | None:
+    """Gain by leaving out one operating point after another, both models refitted without it."""
+    problem = setup.problem
+    if len(problem.groups) < 2:
+        return None
+    errors = []
+    for i, group in enumerate(problem.groups):
+        rest = tuple(g for k, g in enumerate(problem.groups) if k != i)
+        part = replace(problem, groups=rest)
+        models = []
+        for start in (result.baseline, result.final):
+            remainders = [W for k, W in enumerate(start.remainders) if k != i]
+            models.append(
+                fit(part, start.model, base_names=setup.names, iterations=4, remainders=remainders).model
+            )
+        errors.append(segment_errors(problem, (group,), *models)[0])
+    joined = type(errors[0])(
+        tuple(n for e in errors for n in e.segments),
+        *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")),
+    )
+    return measure_gain(
+        joined, problem.structure.n, "leave-one-operating-point-out", np.random.default_rng(SEED)
+    )
+
+
+def make_verdict(
+    dataset: Dataset,
+    setup: Setup,
+    result: Attribution,
+    gain: Gain | None,
+    first: Sequence[Prediction],
+    last: Sequence[Prediction],
+) -> Verdict:
+    """Put the result into the words and numbers of verdict.json."""
+    final = result.final
+    left = result.left_share if result.detected else 0.0
+    unknown = result.detected and (
+        result.unknown or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE) or not final.model.effects
+    )
+    causes = []
+    trust = known_probability(left, result.unknown) if result.detected else 1.0
+    covariance = final.covariance()
+    named = [r for r in result.rounds if not r.candidates[0].hypothesis.decoy]
+    for i, effect in enumerate(final.model.effects):
+        candidates = named[i].candidates if i < len(named) else ()
+        causes.append(_cause(effect, candidates, final, covariance, trust))
+    verdict = "unknown cause remains" if unknown else "noise floor reached"
+    values, undetermined = baseline_values(final)
+    description = describe(setup.problem, last) if unknown else None
+    return Verdict(
+        dataset=dataset.name,
+        baseline=values,
+        discrepancy=Discrepancy(
+            result.detected,
+            result.p_value,
+            result.baseline.chi2_per_dof,
+            where(setup.problem, result.baseline, first) if result.detected else (),
+        ),
+        causes=tuple(causes),
+        unexplained_share=float(left),
+        unexplained_verdict=verdict,
+        gain=gain,
+        next_experiment=next_experiment(causes, unknown),
+        sentence=sentence(causes, unknown, result.detected, gain),
+        unidentified=undetermined,
+        residual_description=description,
+    )
+
+
+def known_probability(left: float, decoy_won: bool) -> float:
+    """How far the names can be trusted, from the share of the discrepancy that they leave."""
+    if decoy_won:
+        return 0.4
+    return float(1.0 / (1.0 + (left / 0.15) ** 2))
+
+
+def _cause(
+    effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float
+) -> Cause:
+    h = effect.hypothesis
+    same = [c for c in candidates if c.hypothesis.effect == h.effect and c.hypothesis.place == h.place]
+    own = sum(c.probability for c in same) if candidates else 1.0
+    others: dict[tuple[str, str], float] = {}
+    for c in candidates:
+        if c not in same and c.probability > 1e-3:
+            name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
+            others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
+    parameters = reported_parameters(effect, final, covariance)
+    numbers = {k: v.value for k, v in parameters.items()}
+    return Cause(
+        effect=h.effect,
+        joint=h.place,
+        parameters=parameters,
+        probability=float(np.clip(own * trust, 0.0, 0.999)),
+        evidence=h.sentence.format(joint=h.place, **numbers),
+        alternatives=tuple(
+            Alternative(e, p, float(v * trust)) for (e, p), v in sorted(others.items(), key=lambda x: -x[1])
+        ),
+    )
+
+
+def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> dict[str, Value]:
+    """Parameters under their catalogue names, SI, with standard deviations."""
+    h = effect.hypothesis
+    index = {name: i for i, name in enumerate(final.names)}
+    out: dict[str, Value] = {}
+    std = {}
+    for q, v in zip(h.parameters, effect.p, strict=True):
+        i = index[f"{h.effect}@{h.place}:{q.name}"]
+        s = float(np.sqrt(max(covariance[i, i], 0.0)))
+        std[q.name] = s * abs(v) if q.log else s
+        if not q.nuisance:
+            out[q.name] = Value(float(v), std[q.name], q.unit)
+    if "sine" in out:
+        a, b = out.pop("sine"), out.pop("cosine")
+        amplitude = float(np.hypot(a.value, b.value))
+        sigma = float(np.hypot(a.std, b.std) / np.sqrt(2))
+        phase = float(np.arctan2(b.value, a.value))
+        out = {
+            "amplitude": Value(amplitude, sigma, a.unit),
+            **out,
+            "phase": Value(phase, sigma / max(amplitude, 1e-300), "rad"),
+        }
+    if h.effect in ("transverse_elasticity", "base_elasticity"):
+        axis = h.options["axis"]
+        out |= {f"axis_{n}": Value(float(a), 0.0, "1") for n, a in zip("xyz", axis, strict=True)}
+    return out
+
+
+def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain | None) -> str:
+    """The verdict in one sentence."""
+    if not detected:
+        return "The simulation agrees with the data: nothing beyond noise was found."
+    sure = [c for c in causes if c.probability > 0.5]
+    if not sure:
+        return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
+    names = " and ".join(f"{c.effect.replace('_', ' ')} at {c.joint} ({c.probability:.0%})" for c in sure)
+    closed = "" if gain is None or gain.gap_closed is None else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
+    rest = ", and an unknown cause remains" if unknown else ""
+    return f"The simulation misses {names}{closed}{rest}."
+
+
+ADVICE = {
+    frozenset({"coulomb_friction", "stribeck_friction"}): "a slow sweep at constant speed in both directions",
+    frozenset({"coulomb_friction", "presliding_friction"}): "the same excitation at a quarter of the amplitude",
+    frozenset({"backlash", "softening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
+    frozenset({"backlash", "hardening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
+    frozenset({"torque_delay", "torque_lag"}): "a band up to a third of the sample rate",
+    frozenset({"sensor_delay", "sensor_lag"}): "a band up to a third of the sample rate",
+    frozenset({"cogging", "transmission_error"}): "the same posture with excitation near the resonance, over a whole period of the ripple",
+    frozenset({"payload", "link_inertia"}): "static torques in postures that turn the last link against gravity",
+}
+
+
+def next_experiment(causes: Sequence[Cause], unknown: bool) -> str | None:
+    """What to measure to separate the alternatives, or to see an unknown cause better."""
+    for cause in causes:
+        if cause.probability < 0.9 and cause.alternatives:
+            other = cause.alternatives[0]
+            advice = ADVICE.get(frozenset({cause.effect, other.effect}), "two more postures and a second level of amplitude")
+            return f"To tell {cause.effect} from {other.effect} at {cause.joint}: {advice}."
+    if unknown:
+        return "Two more levels of amplitude and two more postures, to see how the unknown cause scales with motion and load."
+    return None
+
+

@@ -1,0 +1,211 @@
+"""What reports show, computed from fits: where the discrepancy sits, evidence, FRFs, traces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.dataset import Dataset
+from ident.extended import Model, Prediction, predict
+from ident.graybox import equilibrium, linearise, sampled_frf
+from ident.noise import residual_covariance
+from ident.records import Group
+from ident.torque_fit import Fit, Problem, residual
+from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
+
+BANDS = 8
+SHOWN_SECONDS = 6.0
+
+
+def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.05) -> tuple[Where, ...]:
+    """Shares of the whitened discrepancy beyond noise by joint and kind of line, largest first."""
+    totals: dict[tuple[str, str], float] = {}
+    joints = problem.structure.robot.joint_names
+    for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
+        e = fit.weights.apply(g, residual(group, pred))
+        power = np.sum(e**2, axis=0) - 2.0
+        power[:, 0] += 1.0
+        line = group.keep[None, :]
+        kinds = {
+            "static torque": line == 0,
+            "excited lines": group.excited[:, group.keep],
+            "even nonlinear lines": (line % 2 == 0) & (line > 0) & ~group.excited[:, group.keep],
+            "odd nonlinear lines": (line % 2 == 1) & ~group.excited[:, group.keep],
+        }
+        if group.window is not None:
+            kinds = {"motion": np.ones_like(line, bool)}
+        for kind, mask in kinds.items():
+            part = (power * np.broadcast_to(mask, power.shape[:2])[..., None]).sum(axis=(0, 1))
+            for j, name in enumerate(joints):
+                totals[(name, kind)] = totals.get((name, kind), 0.0) + float(max(part[j], 0.0))
+    whole = sum(totals.values()) or 1.0
+    rows = [Where(j, "tau", k, v / whole) for (j, k), v in totals.items() if v / whole >= least]
+    return tuple(sorted(rows, key=lambda w: -w.share))
+
+
+def spectrum_map(
+    problem: Problem, fit: Fit, before: Sequence[Prediction], after: Sequence[Prediction]
+) -> SpectrumMap:
+    """Rms torque residual by operating point, joint and band."""
+    top = max(g.omega[g.keep[-1]] for g in problem.groups) / 2 / np.pi
+    edges = np.geomspace(max(top / 200, 0.05), top * 1.0001, BANDS + 1)
+    edges[0] = 0.0
+    out = np.zeros((3, len(problem.groups), problem.structure.n, BANDS))
+    for g, group in enumerate(problem.groups):
+        frequency = group.omega[group.keep] / 2 / np.pi
+        band = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, BANDS - 1)
+        weight = np.where(frequency > 0, 2.0, 1.0)[:, None]
+        pred = after[g]
+        S = residual_covariance(
+            group,
+            pred.plane.record[:, None, None] * pred.plane.Z,
+            tau_std=problem.tau_std,
+            q_std=problem.q_std,
+            samples=problem.samples(group),
+        )
+        noise = np.einsum("kii->ki", S).real
+        powers = [np.mean(np.abs(residual(group, p)) ** 2, axis=0) for p in (before[g], pred)]
+        for i, power in enumerate([*powers, noise]):
+            np.add.at(out[i, g].T, band, power * weight)
+    return SpectrumMap(edges, *np.sqrt(out), tuple(g.operating_point for g in problem.groups))
+
+
+def frf_views(dataset: Dataset, problem: Problem, before: Model, after: Model) -> tuple[FrfView, ...]:
+    """Measured FRFs with the linearised baseline and extended models, where they can be formed."""
+    from ident.frf import estimate_frf
+    from robot_assets.errors import DataError
+
+    try:
+        frf = estimate_frf(dataset)
+    except DataError:
+        return ()
+    views = []
+    for i, point in enumerate(frf.operating_points):
+        curves = []
+        for model in (before, after):
+            structure, par = model.built()
+            lin = linearise(structure, equilibrium(structure, par, frf.q0[i]))
+            curves.append(
+                sampled_frf(structure, par, lin, frf.frequency, problem.sampling.sample_time, problem.sampling.hold)[0]
+            )
+        views.append(FrfView(point, frf.frequency, frf.G[i], frf.total_std[i], *curves))
+    return tuple(views)
+
+
+def torque_traces(
+    dataset: Dataset, groups: Sequence[Group], pairs: Sequence[tuple[Prediction, Prediction]]
+) -> tuple[TorqueTrace, ...]:
+    """Measured and predicted torque in time, for the first segment of each group."""
+    out = []
+    for group, (a, b) in zip(groups, pairs, strict=True):
+        signals = []
+        for X in (group.U, a.U, b.U, group.Q):
+            Y = X[:1].copy()
+            Y[:, group.keep[-1] + 1 :] = 0.0
+            signals.append(group.to_time(Y)[0])
+        t = np.arange(group.n_time) * group.period_time / group.n_time
+        show = t <= SHOWN_SECONDS
+        if group.window is not None:
+            first = dataset_segment(dataset, group.segments[0])
+            show = t <= first.t[-1] - first.t[0]
+        out.append(TorqueTrace(group.segments[0], t[show], *(s[show] for s in signals)))
+    return tuple(out)
+
+
+def dataset_segment(dataset: Dataset, name: str):
+    """Segment by name."""
+    return next(s for s in dataset.segments if s.name == name)
+
+
+LABELS = {
+    "v": "motor velocity, rad/s",
+    "q": "motor position, rad",
+    "delta": "gear deflection, rad",
+    "time": "time, s",
+    "torque": "recorded torque, N m",
+    "posture": "measured torque beyond gravity and baseline, N m",
+    "frequency": "frequency, Hz",
+}
+
+
+def evidence_plot(problem: Problem, fit: Fit, predictions: Sequence[Prediction], index: int) -> EvidencePlot:
+    """Residual torque without one cause, against the variable that explains it, and with it."""
+    effect = fit.model.effects[index]
+    h = effect.hypothesis
+    rest = Model(fit.model.structure, fit.model.par, tuple(e for i, e in enumerate(fit.model.effects) if i != index))
+    j = max(h.joint, 0)
+    xs, ys, ms = [], [], []
+    for group, pred in zip(problem.groups, predictions, strict=True):
+        without = predict(rest, group, problem.sampling)
+        if h.joint < 0:
+            power = np.sum(np.abs(group.U - without.U) ** 2, axis=(0, 1))
+            j = int(np.argmax(power / np.maximum(np.sum(np.abs(group.U[:, 1:]) ** 2, axis=(0, 1)), 1e-300)))
+        motion = pred.motion(group)
+        band = slice(group.keep[-1] + 1, None)
+        curves = []
+        for X in (group.U - without.U, pred.U - without.U):
+            X = X[..., j : j + 1].copy()
+            X[:, band] = 0.0
+            curves.append(group.to_time(X)[..., 0])
+        variable = {
+            "v": lambda m=motion: m.v(j),
+            "q": lambda m=motion: m.q(j),
+            "delta": lambda m=motion: m.delta(j),
+            "time": lambda m=motion: m.time,
+            "torque": lambda m=motion: m.torque(j),
+        }.get(h.variable, lambda c=curves: c[1])()
+        step = max(1, variable.size // (1500 // max(len(problem.groups), 1) + 1))
+        xs.append(variable.ravel()[::step])
+        ys.append(curves[0].ravel()[::step])
+        ms.append(curves[1].ravel()[::step])
+    x, y, m = (np.concatenate(v) for v in (xs, ys, ms))
+    order = np.argsort(x)
+    label = LABELS.get(h.variable, "fitted effect, N m")
+    if h.variable in ("posture", "frequency"):
+        label = "torque of the fitted effect, N m"
+    joint = problem.structure.robot.joint_names[j]
+    return EvidencePlot(index, f"{h.effect.replace('_', ' ')} at {h.place}", label, f"residual torque of {joint}, N m", x, y, x[order], m[order])
+
+
+def describe(problem: Problem, predictions: Sequence[Prediction]) -> str:
+    """Where an unexplained residual sits: joint, band, growth with level, best variable."""
+    n = problem.structure.n
+    power, band = np.zeros(n), None
+    levels: dict[float, list[float]] = {}
+    spectra = []
+    for group, pred in zip(problem.groups, predictions, strict=True):
+        e = np.abs(residual(group, pred)) ** 2
+        power += e.sum(axis=(0, 1))
+        spectra.append((group.omega[group.keep] / 2 / np.pi, e.sum(axis=0)))
+        for s, level in enumerate(group.amplitude):
+            levels.setdefault(float(level), []).append(float(e[s].sum()))
+    j = int(np.argmax(power))
+    frequency = np.concatenate([f for f, _ in spectra])
+    lines = np.concatenate([e[:, j] for _, e in spectra])
+    order = np.argsort(frequency)
+    share = np.cumsum(lines[order]) / max(lines.sum(), 1e-300)
+    low, high = (float(frequency[order][np.searchsorted(share, v)]) for v in (0.1, 0.9))
+    band = f"between {low:.3g} and {high:.3g} Hz"
+    law = ""
+    if len(levels) > 1:
+        x = np.log(sorted(levels))
+        y = 0.5 * np.log([np.mean(levels[v]) for v in sorted(levels)])
+        law = f", growing with level to the power {np.polyfit(x, y, 1)[0]:.1f}"
+    correlation = {}
+    for name in ("v", "q", "delta", "torque"):
+        top = []
+        for group, pred in zip(problem.groups, predictions, strict=True):
+            motion = pred.motion(group)
+            r = group.to_time((group.U - pred.U)[..., j : j + 1])[..., 0].ravel()
+            x = {"v": motion.v, "q": motion.q, "delta": motion.delta, "torque": motion.torque}[name](j).ravel()
+            bins = np.digitize(x, np.quantile(x, np.linspace(0.02, 0.98, 30)))
+            count = np.maximum(np.bincount(bins, minlength=31), 1)
+            mean = np.bincount(bins, weights=r, minlength=31) / count
+            top.append(np.sum(count * mean**2) / max(np.sum(r**2), 1e-300))
+        correlation[name] = float(np.mean(top))
+    best = max(correlation, key=correlation.get)
+    return (
+        f"The residual torque sits mostly at {problem.structure.robot.joint_names[j]}, {band}{law};"
+        f" {LABELS[best].split(',')[0]} explains {correlation[best]:.0%} of it."
+    )
