@@ -1,0 +1,33 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test test-all bench bench-blind lint
+
+$(STAMP): requirements.lock pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/simgap demo --out out/demo --seed 7
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -m "not slow" -n 2
+
+test-all: $(STAMP)
+	$(BIN)/python -m pytest -n 2
+
+bench: $(STAMP)
+	$(BIN)/python benchmarks/bench_plant.py
+	$(BIN)/python benchmarks/bench_estimators.py
+	$(BIN)/python benchmarks/bench_diagnose.py
+
+bench-blind: $(STAMP)
+	$(BIN)/python benchmarks/blind.py --size quick
+
+lint: $(STAMP)
+	$(BIN)/ruff check robot_assets sim ident tests benchmarks
+	$(BIN)/mypy
