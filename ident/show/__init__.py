@@ -1,0 +1,1 @@
+"""Reports, recordings and exported models."""
