@@ -31,7 +31,8 @@ MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may 
 NATS_PER_PARAMETER = 2.0
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
-MIN_SHARE = 0.02  # share of the discrepancy that a cause must explain
+MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
+WORTH_A_REFIT = 0.15  # the same for a screened gain: linear steps understate strong effects
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def attribute(
             break
         best = found.candidates[0]
         fall = (current.cost - best.fit.cost) / found.scale
-        share = (current.cost - best.fit.cost) / max(baseline.cost - baseline.count, 1.0)
+        share = (current.cost - best.fit.cost) / max(current.cost - current.count, 1.0)
         if fall < MIN_EVIDENCE or share < MIN_SHARE:
             break
         if best.hypothesis.decoy:
@@ -135,7 +136,8 @@ def attribute_once(
     scores = screen(problem, current, preds, hypotheses)
     names = parameter_names(problem.structure.robot)
     candidates = []
-    chosen = choose(scores)
+    excess = max(current.cost - current.count, 1.0)
+    chosen = choose(scores) if scores and scores[0].gain > WORTH_A_REFIT * excess else []
     for i, score in enumerate(chosen):
         if progress is not None:
             h = score.hypothesis

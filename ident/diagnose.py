@@ -14,7 +14,7 @@ from ident.extended import Effect, Prediction, predict
 from ident.gain import measure_gain, segment_errors
 from ident.graybox import Parameters, build_structure, parameter_names, parameter_unit
 from ident.inverse import Sampling
-from ident.noise import difference_noise
+from ident.noise import difference_noise, sample_noise
 from ident.records import Group, build_groups
 from ident.reporting import describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
 from ident.torque_fit import Fit, Problem, fit
@@ -76,7 +76,23 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
 def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:
     """Baseline parameters by maximum likelihood on the torque residual."""
     setup = set_up(dataset)
-    return setup, fit_baseline(setup.problem, progress)
+    result = fit_baseline(setup.problem, progress)
+    return replace(setup, problem=with_measured_noise(setup.problem, result)), result
+
+
+def with_measured_noise(problem: Problem, result: Fit) -> Problem:
+    """Sample noise from the scatter between periods, for records that have a single one."""
+    levels = []
+    for group, W in zip(problem.groups, result.remainders, strict=True):
+        pred = predict(result.model, group, problem.sampling, W=W, steps=0)
+        Z = pred.plane.record[:, None, None] * pred.plane.Z
+        found = sample_noise(group, Z, problem.samples(group))
+        if found is not None:
+            levels.append(found)
+    if not levels:
+        return problem
+    tau, q = (np.median([level[i] for level in levels], axis=0) for i in range(2))
+    return replace(problem, tau_std=np.maximum(tau, 1e-6), q_std=np.maximum(q, 1e-10))
 
 
 def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:

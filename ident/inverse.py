@@ -32,7 +32,8 @@ from ident.graybox import (
 )
 from ident.records import Group
 
-REMAINDER_STEPS = 8  # fixed-point steps for the geometric remainder from a cold start
+REMAINDER_STEPS = 40  # fixed-point steps at most for the geometric remainder from a cold start
+REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
 
 
 @dataclass(frozen=True)
@@ -244,7 +245,7 @@ def solve(
         Q_a = link_motion(structure, par, plane, Q, W, torques)
         W_next = geometric_remainder(structure, plane, group, Q_a)
         change, W = np.abs(W_next - W).max(), W_next
-        if change < 1e-7 * np.abs(W).max():
+        if change < REMAINDER_CHANGE * np.abs(W).max():
             break
     Q_a = link_motion(structure, par, plane, Q, W, torques)
     delta = Q @ par.coupling.T - Q_a[..., structure.driven]

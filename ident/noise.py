@@ -71,6 +71,21 @@ def residual_covariance(
     return root @ shape @ np.conj(np.swapaxes(root, 1, 2))
 
 
+def sample_noise(group: Group, Z: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Standard deviation of white noise on torque and position samples, (n,) each.
+
+    From the scatter of the torque residual between periods; None where there is one period.
+    """
+    P = group.U_periods.shape[1]
+    if P < 2:
+        return None
+    e = group.U_periods - np.einsum("lij,splj->spli", Z, group.Q_periods, optimize=True)
+    d = (e - e.mean(axis=1, keepdims=True))[:, :, group.keep]
+    power = np.einsum("spki->ki", np.abs(d) ** 2) / (e.shape[0] * (P - 1))
+    tau_var, q_var = _white_levels(power, Z[group.keep])
+    return np.sqrt(tau_var * samples), np.sqrt(q_var * samples)
+
+
 def difference_noise(x: np.ndarray) -> np.ndarray:
     """Standard deviation of white noise on a smooth signal (N, n), from fourth differences; (n,).
 

@@ -18,6 +18,7 @@ from robot_assets.errors import DataError
 RETURN_TIME = 1.0  # s, least time in which a motion is led back to its start
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
 POINTS_PER_LINE = 8  # time grid of nonlinear laws, in points per highest line
+SIGNAL_BAND = 1.15  # band of the signals that laws see, in multiples of the compared band
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) ->
     first = members[0]
     fs, N = dataset.sample_rate, int(first.period)
     top = min(int(np.floor(band_hz * N / fs + 1e-9)), N // 2 - 1)
-    n_lines = min(int(np.ceil(1.15 * top)) + 2, N // 2)
+    n_lines = min(int(np.ceil(SIGNAL_BAND * top)) + 2, N // 2)
     U_p = np.stack([_lines(s.periodic("tau"), n_lines) for s in members])
     Q_p = np.stack([_lines(s.periodic("q"), n_lines) for s in members])
     link = None

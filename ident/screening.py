@@ -19,6 +19,9 @@ from ident.records import Group
 from ident.torque_fit import Fit, Problem, jacobian, observe_columns, residual
 
 
+PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
+
+
 @dataclass(frozen=True)
 class Score:
     """Best unit response of a hypothesis: fall of the cost, its degrees of freedom, a start."""
@@ -195,7 +198,7 @@ def _joint_response(
 
 
 def position_lines(
-    problem: Problem, predictions: Sequence[Prediction], joint: int, count: int = 3
+    problem: Problem, predictions: Sequence[Prediction], joint: int, count: int = 2
 ) -> tuple[float, ...]:
     """Wave numbers (1/rad) at which the residual torque of a joint is periodic in its motor angle.
 
@@ -210,7 +213,7 @@ def position_lines(
         R = (group.U - pred.U)[..., joint : joint + 1].copy()
         R[:, group.keep[-1] + 1 :] = 0.0
         r = group.to_time(R)[..., 0]
-        step = max(1, q.shape[1] // 700)
+        step = max(1, q.shape[1] // 600)
         v, a = motion.v(joint), motion.acceleration(joint)
         for s in range(len(q)):
             nuisance = np.stack(
@@ -221,10 +224,11 @@ def position_lines(
             qs.append((q[s, ::step], nuisance))
             rs.append(x - nuisance @ (nuisance.T @ x))
     spans = [np.ptp(q) for q, _ in qs]
-    span = float(np.median(spans))
-    if span <= 0:
+    if max(spans) <= 0:
         return ()
-    # Small records first lose a phase; the coarse grid resolves the median excursion.
+    loudest = np.argsort([-float(r @ r) for r in rs])[:PERIODOGRAM_RECORDS]
+    qs, rs = [qs[i] for i in loudest], [rs[i] for i in loudest]
+    spans = [spans[i] for i in loudest]
     coarse = np.arange(1.0, 260.0) * (0.7 * np.pi / max(spans))
     power = np.zeros(len(coarse))
     for (q, N), r in zip(qs, rs, strict=True):
@@ -248,7 +252,7 @@ def position_lines(
 def _refine(qs, rs, center: float, width: float) -> float:
     """Best wave number near ``center`` with one phase for all records."""
     spread = np.ptp([q.mean() for q, _ in qs]) + np.ptp(qs[0][0])
-    fine = np.linspace(center - 1.5 * width, center + 1.5 * width, int(np.clip(6 * width * spread, 41, 3000)))
+    fine = np.linspace(center - 1.5 * width, center + 1.5 * width, int(np.clip(6 * width * spread, 41, 1500)))
     cc = ss = cs = y1 = y2 = 0.0
     for (q, N), r in zip(qs, rs, strict=True):
         stride = max(1, len(q) // 250)

@@ -1,0 +1,154 @@
+"""Blind benchmark: effects drawn and hidden in the plant, and what the diagnosis names.
+
+The diagnosis sees the files of a dataset alone. Drives are drawn within a factor of two of the
+nominal; the plant's step and integrator differ from case to case.
+
+    python benchmarks/blind.py --size quick --out benchmarks/results/blind-quick.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from concurrent.futures import Executor, ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "hardening_stiffness", "payload")
+SIZES = {"smoke": 6, "quick": 26, "full": 120}
+
+
+def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: str) -> dict:
+    """Draw, simulate, write, read, diagnose, compare."""
+    from ident.dataset_io import load_dataset, save_dataset
+    from ident.diagnose import diagnose_fully
+    from ident.excitation import make_plan, operating_points
+    from robot_assets.robot import load_robot
+    from sim import draw_effect, run_experiment
+    from sim.effects import EFFECTS, parameters_of
+    from sim.experiment import draw_drives
+    from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+
+    rng = np.random.default_rng(seed)
+    robot = load_robot(robot_name)
+    pool = names or tuple(EFFECTS)
+    hidden = []
+    for i in range(count):
+        name = pool[(seed + i * 7) % len(pool)]
+        hidden.append(draw_effect(rng, robot, names=(name,), strength=float(np.exp(rng.uniform(-0.5, 0.7)))))
+    plant = build_plant(robot)
+    postures = operating_points(robot, 3, rng)
+    plan = make_plan(
+        robot,
+        points=2,
+        seed=seed,
+        postures=postures,
+        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
+        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
+        period=int(rng.choice([3000, 4000])),
+    )
+    truth = [{"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e))} for e in hidden]
+    began = time.perf_counter()
+    try:
+        data = run_experiment(plan, hidden, seed=seed, drives=draw_drives(rng, robot), timestep=float(rng.choice([2.5e-4, 2e-4])))
+    except Exception as err:
+        return {"seed": seed, "truth": truth, "error": f"{type(err).__name__}: {err}"}
+    simulated = time.perf_counter() - began
+    with tempfile.TemporaryDirectory() as folder:
+        save_dataset(data, Path(folder) / "d")
+        began = time.perf_counter()
+        result = diagnose_fully(load_dataset(Path(folder) / "d"))
+    v = result.verdict.to_dict()
+    return {
+        "seed": seed,
+        "truth": truth,
+        "causes": [
+            {k: c[k] for k in ("effect", "joint", "probability", "alternatives", "parameters")} for c in v["causes"]
+        ],
+        "unexplained": v["unexplained"],
+        "chi2": v["discrepancy"]["chi2_per_dof"],
+        "gain": v["gain"],
+        "candidates": [list(r) for r in result.candidates],
+        "simulated_s": simulated,
+        "diagnosed_s": time.perf_counter() - began,
+    }
+
+
+def _plain(values: dict) -> dict:
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+
+
+def judge(row: dict) -> dict:
+    """Right effect and place, worst relative parameter error of the first cause."""
+    if "error" in row:
+        return {"right": False, "effect": False, "note": row["error"]}
+    truth, causes = row["truth"], row["causes"]
+    named = {(c["effect"], c["joint"]) for c in causes if c["probability"] > 0.5}
+    wanted = {(t["effect"], t["place"]) for t in truth}
+    right = named == wanted
+    errors = []
+    for t in truth:
+        for c in causes:
+            if (c["effect"], c["joint"]) == (t["effect"], t["place"]):
+                for k, v in t["parameters"].items():
+                    if isinstance(v, float) and k in c["parameters"] and k not in ("phase", "asymmetry", "coulomb") and v:
+                        errors.append(abs(c["parameters"][k]["value"] / v - 1))
+    return {"right": right, "any": bool(named & wanted), "named": sorted(named), "errors": errors}
+
+
+def run(cases: list[tuple], executor: Executor) -> list[dict]:
+    """All cases, in order, on any executor."""
+    futures = [executor.submit(run_case, *case) for case in cases]
+    rows = []
+    for future in futures:
+        row = future.result()
+        row["judged"] = judge(row)
+        rows.append(row)
+        print(line(row), flush=True)
+    return rows
+
+
+def line(row: dict) -> str:
+    truth = " + ".join(f"{t['effect']}@{t['place']}" for t in row["truth"]) or "nothing"
+    if "error" in row:
+        return f"{row['seed']:5d} ERROR {truth}: {row['error']}"
+    named = ", ".join(f"{c['effect']}@{c['joint']} {c['probability']:.2f}" for c in row["causes"]) or "nothing"
+    closed = (row["gain"] or {}).get("gap_closed")
+    mark = "ok  " if row["judged"]["right"] else "MISS"
+    error = max(row["judged"]["errors"], default=float("nan"))
+    return (
+        f"{row['seed']:5d} {mark} {truth} -> {named} | {row['unexplained']['verdict']} {row['unexplained']['share']:.3f}"
+        f" chi2 {row['chi2']:.3g} err {error:.3f} closed {closed if closed is None else round(closed, 3)}"
+        f" {row['simulated_s']:.0f}+{row['diagnosed_s']:.0f} s"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", choices=SIZES, default="quick")
+    parser.add_argument("--effects", default="", help="comma-separated; all where empty; 'six' for the first six")
+    parser.add_argument("--count", type=int, default=1, help="effects hidden at once; 0 for none")
+    parser.add_argument("--robot", default="ur10")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    names = ISSUE_SIX if args.effects == "six" else tuple(filter(None, args.effects.split(","))) or None
+    cases = [(args.seed + i, names, args.count, args.robot) for i in range(SIZES[args.size])]
+    with ProcessPoolExecutor(args.workers) as executor:
+        rows = run(cases, executor)
+    right = sum(r["judged"]["right"] for r in rows)
+    errors = [e for r in rows for e in r["judged"].get("errors", [])]
+    closed = [r["gain"]["gap_closed"] for r in rows if r.get("gain") and r["gain"]["gap_closed"] is not None]
+    print(f"{right} of {len(rows)} right; median parameter error {np.median(errors) if errors else float('nan'):.3g};"
+          f" median gap closed {np.median(closed) if closed else float('nan'):.3g}")
+    if args.out:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
