@@ -256,30 +256,30 @@ def solve(
 
 
 def baseline_jacobian(
-    structure: Structure, par: Parameters, plane: Plane, solution: Solution
+    structure: Structure, par: Parameters, plane: Plane, solution: Solution, top: int
 ) -> np.ndarray:
     """Derivative of the predicted torque by the log-parameters and, last, the timing.
 
-    Torques of effects and the geometric remainder are held. Returns (S, L, n, n_theta).
+    Torques of effects and the geometric remainder are held. Lines 0..top-1: (S, top, n, n_theta).
     """
     n, n_e = structure.n, len(structure.elastic)
-    S, L = solution.U.shape[:2]
-    s = plane.s
-    out = np.zeros((S, L, n, 4 * n + 2 * n_e + 1), complex)
-    rec = plane.record[:, None, None]
-    spring = rec * plane.spring_gain
-    out[..., :n] = spring * (par.stiffness * solution.delta)[:, :, None, :]
-    out[..., n : 2 * n] = spring * (par.damping * s[:, None] * solution.delta)[:, :, None, :]
+    s = plane.s[:top, None]
+    delta, Q, Q_a = solution.delta[:, :top], solution.Q[:, :top], solution.Q_a[:, :top]
+    out = np.zeros((len(Q), top, n, 4 * n + 2 * n_e + 1), complex)
+    rec = plane.record[:top, None, None]
+    spring = rec * plane.spring_gain[:top]
+    out[..., :n] = spring * (par.stiffness * delta)[:, :, None, :]
+    out[..., n : 2 * n] = spring * (par.damping * s * delta)[:, :, None, :]
     k = np.arange(n)
-    motor = plane.record[:, None] * s[:, None] * solution.Q
-    out[..., k, 2 * n + k] = motor * s[:, None] * par.inertia
+    motor = plane.record[:top, None] * s * Q
+    out[..., k, 2 * n + k] = motor * s * par.inertia
     out[..., k, 3 * n + k] = motor * par.viscous
     if n_e:
-        hinge = rec * plane.link_gain[:, :, structure.elastic]
-        q_e = solution.Q_a[..., structure.elastic]
+        hinge = rec * plane.link_gain[:top, :, structure.elastic]
+        q_e = Q_a[..., structure.elastic]
         out[..., 4 * n : 4 * n + n_e] = hinge * (par.elastic_stiffness * q_e)[:, :, None, :]
-        out[..., 4 * n + n_e : -1] = hinge * (par.elastic_damping * s[:, None] * q_e)[:, :, None, :]
-    out[..., -1] = s[:, None] * solution.U
+        out[..., 4 * n + n_e : -1] = hinge * (par.elastic_damping * s * q_e)[:, :, None, :]
+    out[..., -1] = s * solution.U[:, :top]
     return out
 
 

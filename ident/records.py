@@ -17,8 +17,8 @@ from robot_assets.errors import DataError
 
 RETURN_TIME = 1.0  # s, least time in which a motion is led back to its start
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
-POINTS_PER_LINE = 8  # time grid of nonlinear laws, in points per highest line
-SIGNAL_BAND = 1.15  # band of the signals that laws see, in multiples of the compared band
+POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
+SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
 
 
 @dataclass(frozen=True)

@@ -169,10 +169,14 @@ def unpack(model: Model, x: np.ndarray, limit: float) -> Model:
 
 
 def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> np.ndarray:
-    """Derivative of the predicted recorded torque by the fitted coordinates; (S, L, n, p)."""
+    """Derivative of the predicted recorded torque by the fitted coordinates; (S, top, n, p).
+
+    ``top`` is the number of lines that are compared, all of them for a motion.
+    """
     m = len(model.par.to_log())
+    top = compared_lines(group)
     n, n_e = model.structure.n, len(model.structure.elastic)
-    full = baseline_jacobian(pred.structure, pred.par, pred.plane, pred.solution)
+    full = baseline_jacobian(pred.structure, pred.par, pred.plane, pred.solution, top)
     extra = len(pred.structure.elastic) - n_e
     keep = [*range(4 * n + n_e), *range(4 * n + n_e + extra, 4 * n + n_e + extra + n_e), full.shape[-1] - 1]
     base = full[..., keep] if extra else full
@@ -180,10 +184,10 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> 
         h = effect.hypothesis
         if h.channel == "drive":
             motion, j = pred.motion(group), h.joint
-            zero = np.zeros_like(pred.U[..., j])
-            offset = h.law(effect.p, motion, j, 0.0, zero)
-            columns = np.moveaxis(base[:, :, j], -1, 0)
-            base[:, :, j] = np.moveaxis(h.law(effect.p, motion, j, 0.0, columns) - offset, 0, -1)
+            full = np.zeros((base.shape[-1], *pred.U.shape[:2]), complex)
+            full[:, :, :top] = np.moveaxis(base[:, :, j], -1, 0)
+            passed = h.law(effect.p, motion, j, 0.0, full) - h.law(effect.p, motion, j, 0.0, 0 * full[0])
+            base[:, :, j] = np.moveaxis(passed[:, :, :top], 0, -1)
     for effect in model.effects:
         h = effect.hypothesis
         if h.channel == "spring" and not h.options.get("kinematic"):
@@ -191,15 +195,20 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> 
                 x = pack(model)
                 x[c] += 1e-3
                 moved = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W)
-                base[..., c] = (moved.U - pred.U) / 1e-3
+                base[..., c] = (moved.U - pred.U)[:, :top] / 1e-3
     columns = [base]
     for i, effect in enumerate(model.effects):
         for c in range(len(effect.p)):
-            columns.append(_effect_column(problem, model, group, pred, i, c)[..., None])
+            columns.append(_effect_column(problem, model, group, pred, i, c)[:, :top, :, None])
     out = np.concatenate(columns, axis=-1)
     if not problem.free_timing:
         out[..., m] = 0.0
     return out
+
+
+def compared_lines(group: Group) -> int:
+    """Lines that enter a comparison: up to the band for periodic data, all for a motion."""
+    return len(group.keep) if group.window is None else len(group.omega)
 
 
 def _effect_column(
