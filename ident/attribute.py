@@ -23,6 +23,7 @@ from ident.torque_fit import ANNEALING, Fit, Problem, fit
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
+RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 REFITS = 8  # candidates refitted in a round
 PER_EFFECT = 2  # of one effect, at most
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
@@ -74,10 +75,30 @@ class Attribution:
 
 
 def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None) -> Fit:
-    """Baseline parameters of the gray-box without effects."""
+    """Baseline parameters of the gray-box without effects.
+
+    Where the fit leaves more than the noise it is started again with other dampers: they are
+    determined far worse than springs, and a damper that has once collapsed does not come back.
+    """
     names = parameter_names(problem.structure.robot)
     start = Model(problem.structure, problem.nominal)
-    return fit(problem, start, base_names=names, annealing=ANNEALING, progress=progress)
+    best = fit(problem, start, base_names=names, annealing=ANNEALING, progress=progress)
+    if best.chi2_per_dof > DETECTION_EXCESS:
+        for factor in RESTART_DAMPING:
+            par = best.model.par
+            damping = np.maximum(par.damping, problem.nominal.damping) * factor
+            again = Model(problem.structure, replace(par, damping=damping))
+            other = fit(
+                problem,
+                again,
+                base_names=names,
+                annealing=ANNEALING[-2:],
+                iterations=8,
+                remainders=best.remainders,
+                progress=progress,
+            )
+            best = min(best, other, key=lambda f: f.cost)
+    return best
 
 
 def discrepancy_p_value(result: Fit) -> float:
@@ -153,7 +174,7 @@ def attribute_once(
                 weights=current.weights,
                 remainders=current.remainders,
             )
-        except (np.linalg.LinAlgError, ValueError):
+        except (np.linalg.LinAlgError, ValueError, RuntimeError):
             continue
         candidates.append(Candidate(score.hypothesis, result, 0.0))
     if not candidates:

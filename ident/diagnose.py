@@ -16,7 +16,7 @@ from ident.graybox import Parameters, build_structure, parameter_names, paramete
 from ident.inverse import Sampling
 from ident.noise import difference_noise, sample_noise
 from ident.records import Group, build_groups
-from ident.reporting import describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
+from ident.reporting import affected_joints, describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
 from ident.torque_fit import Fit, Problem, fit
 from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict
 
@@ -123,16 +123,22 @@ def diagnose_fully(
     result = attribute(problem, baseline, max_causes=max_causes, progress=say)
     say("gain on held-out data")
     before, after = baseline.model, result.final.model
+    first = [
+        predict(before, g, problem.sampling, W=W, steps=0)
+        for g, W in zip(problem.groups, baseline.remainders, strict=True)
+    ]
+    affected = affected_joints(problem, baseline, first) if result.detected else ()
     if setup.held_out:
         errors, pairs = segment_errors(problem, setup.held_out, before, after)
-        gain = measure_gain(errors, dataset.n, "validation segments", np.random.default_rng(SEED))
+        gain = measure_gain(
+            errors, dataset.joints, affected, "validation segments", np.random.default_rng(SEED)
+        )
         shown = setup.held_out
     else:
-        gain = leave_one_out(setup, result)
+        gain = leave_one_out(setup, result, affected)
         shown = problem.groups[:1]
         pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
     say("evidence")
-    first = [predict(before, g, problem.sampling, W=W, steps=0) for g, W in zip(problem.groups, baseline.remainders, strict=True)]
     last = [predict(after, g, problem.sampling) for g in problem.groups]
     verdict = make_verdict(dataset, setup, result, gain, first, last)
     kept = result.rounds if len(verdict.causes) else ()
@@ -154,7 +160,7 @@ def diagnose_fully(
     )
 
 
-def leave_one_out(setup: Setup, result: Attribution) -> Gain | None:
+def leave_one_out(setup: Setup, result: Attribution, affected: Sequence[int]) -> Gain | None:
     """Gain by leaving out one operating point after another, both models refitted without it."""
     problem = setup.problem
     if len(problem.groups) < 2:
@@ -175,7 +181,11 @@ def leave_one_out(setup: Setup, result: Attribution) -> Gain | None:
         *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")),
     )
     return measure_gain(
-        joined, problem.structure.n, "leave-one-operating-point-out", np.random.default_rng(SEED)
+        joined,
+        problem.structure.robot.joint_names,
+        affected,
+        "leave-one-operating-point-out",
+        np.random.default_rng(SEED),
     )
 
 

@@ -19,7 +19,7 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean squared torque error over all joints of each segment, N2 m2; each (segments,)."""
+    """Mean squared torque error of each segment and joint, N2 m2; each (segments, n)."""
 
     segments: tuple[str, ...]
     before: np.ndarray
@@ -43,25 +43,38 @@ def segment_errors(
             group, Z, tau_std=problem.tau_std, q_std=problem.q_std, samples=problem.samples(group)
         )
         share = 1.0 if group.window is None else float(np.mean(group.window**2))
-        noise = share * np.einsum("kii->k", S).real
+        noise = share * np.einsum("kii->ki", S).real
         names += group.segments
         for store, pred in ((out[0], a), (out[1], b)):
             e = group.observe(group.U - pred.U)
-            store.append(_power(np.sum(np.abs(e) ** 2, axis=2)) / share)
-        out[2].append(np.full(len(group.segments), _power(noise[None])[0] / share))
+            store.append(_power(np.abs(e) ** 2) / share)
+        out[2].append(np.repeat(_power(noise[None]) / share, len(group.segments), axis=0))
     return Errors(tuple(names), *(np.concatenate(x) for x in out)), pairs
 
 
 def _power(lines: np.ndarray) -> np.ndarray:
-    """Mean square of a signal from the squared moduli (S, K) of its lines, line 0 first."""
+    """Mean squares (S, n) of signals from the squared moduli (S, K, n) of their lines, line 0 first."""
     return lines[:, 0] + 2 * lines[:, 1:].sum(axis=1)
 
 
-def measure_gain(errors: Errors, n: int, method: str, rng: np.random.Generator) -> Gain:
+def measure_gain(
+    errors: Errors, joints: tuple[str, ...], affected: Sequence[int], method: str, rng: np.random.Generator
+) -> Gain:
     """Rms errors, share of the gap to the noise floor that is closed, and its 95 % interval.
 
     The interval is a percentile bootstrap over segments.
+
+    Args:
+        affected: the joints over which errors are taken: those that carry the discrepancy in the
+            identification data (all where there is none), so that the noise of a large joint does
+            not hide what is gained at a small one.
     """
+    pick_joints = list(affected) if len(affected) else list(range(len(joints)))
+    n = len(pick_joints)
+    errors = Errors(
+        errors.segments, *(x[:, pick_joints].sum(axis=1) for x in (errors.before, errors.after, errors.noise))
+    )
+
     def rms(x: np.ndarray) -> float:
         return float(np.sqrt(np.mean(x) / n))
 
@@ -74,4 +87,6 @@ def measure_gain(errors: Errors, n: int, method: str, rng: np.random.Generator) 
         b, a, f = (np.sqrt(x[pick].mean(axis=1) / n) for x in (errors.before, errors.after, errors.noise))
         ratio = (b - a) / np.maximum(b - f, 1e-300)
         interval = tuple(float(v) for v in np.quantile(ratio, [0.025, 0.975]))
-    return Gain(errors.segments, METRIC, before, after, noise, closed, interval, method)
+    return Gain(
+        errors.segments, METRIC, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints)
+    )

@@ -164,6 +164,8 @@ def build_structure(
     model = pin.Model()
     model.name = robot.name
     model.gravity.linear = np.asarray(robot.gravity, float)
+    parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
+    factors = {parent[link]: factor for link, factor in (scale_links or {}).items()}
     carrier = {0: _add_hinges(model, 0, "base", hinges, pin.SE3.Identity())}
     index: dict[str, int] = {}
     for i in range(1, source.njoints):
@@ -173,17 +175,14 @@ def build_structure(
         )
         index[name] = model.idx_vs[k]
         carrier[i] = _add_hinges(model, k, name, hinges, pin.SE3.Identity())
-        model.appendBodyToJoint(carrier[i], source.inertias[i], pin.SE3.Identity())
+        own, factor = source.inertias[i], factors.get(i, 1.0)
+        scaled = pin.Inertia(own.mass * factor, own.lever, own.inertia * factor)
+        model.appendBodyToJoint(carrier[i], scaled, pin.SE3.Identity())
     bodies = {
         f.name: (carrier[f.parentJoint], f.placement)
         for f in source.frames
         if f.type == pin.FrameType.BODY
     }
-    parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
-    for link, factor in (scale_links or {}).items():
-        own = source.inertias[parent[link]]
-        extra = pin.Inertia(own.mass * (factor - 1.0), own.lever, own.inertia * (factor - 1.0))
-        model.appendBodyToJoint(bodies[link][0], extra, pin.SE3.Identity())
     known = [
         (load.link, pin.Inertia(load.mass, np.asarray(load.com), np.asarray(load.inertia)))
         for load in robot.loads

@@ -44,6 +44,15 @@ def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: 
     return tuple(sorted(rows, key=lambda w: -w.share))
 
 
+def affected_joints(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.1) -> tuple[int, ...]:
+    """Joints that carry at least a share ``least`` of the whitened discrepancy."""
+    names = problem.structure.robot.joint_names
+    total = dict.fromkeys(names, 0.0)
+    for w in where(problem, fit, predictions, least=0.0):
+        total[w.joint] += w.share
+    return tuple(j for j, name in enumerate(names) if total[name] >= least)
+
+
 def spectrum_map(
     problem: Problem, fit: Fit, before: Sequence[Prediction], after: Sequence[Prediction]
 ) -> SpectrumMap:

@@ -74,6 +74,7 @@ class Gain:
     gap_closed: float | None
     ci95: tuple[float, float] | None
     method: str
+    joints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
