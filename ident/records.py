@@ -15,7 +15,7 @@ import scipy.fft
 from ident.dataset import Dataset, Segment
 from robot_assets.errors import DataError
 
-RETURN_TIME = 1.0  # s, least time in which a motion is led back to its start
+RETURN_TIME = 3.0  # s, least time in which a motion is led back to its start: slow against the arm's modes
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
@@ -216,16 +216,17 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
 
 
 def close_motion(x: np.ndarray, n_return: int) -> np.ndarray:
-    """Append a return from the last sample to the first with matching slope; (N + n_return, n).
+    """Append a return from the last sample to the first; (N + n_return, n).
 
-    A cubic in position: no jump in value or slope enters the spectrum.
+    A polynomial of fifth order with matching slopes and no curvature at its ends, so that the
+    return does not ring in the model.
     """
     width = min(20, len(x) // 4)
-    v_end = (x[-1] - x[-1 - width]) / width
-    v_start = (x[width] - x[0]) / width
-    u = (np.arange(1, n_return + 1) / (n_return + 1))[:, None]
     span = n_return + 1
-    h00, h10 = 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u
-    h01, h11 = -2 * u**3 + 3 * u**2, u**3 - u**2
-    bridge = h00 * x[-1] + h10 * span * v_end + h01 * x[0] + h11 * span * v_start
-    return np.concatenate([x, bridge])
+    v_end = (x[-1] - x[-1 - width]) / width * span
+    v_start = (x[width] - x[0]) / width * span
+    u = (np.arange(1, n_return + 1) / span)[:, None]
+    s = u**3 * (10 - 15 * u + 6 * u**2)
+    leave = u - 6 * u**3 + 8 * u**4 - 3 * u**5
+    arrive = -4 * u**3 + 7 * u**4 - 3 * u**5
+    return np.concatenate([x, x[-1] + (x[0] - x[-1]) * s + v_end * leave + v_start * arrive])

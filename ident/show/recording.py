@@ -13,7 +13,7 @@ from ident.graybox import build_structure
 from ident.verdict import Diagnosis, TorqueTrace
 
 FRAMES_PER_SECOND = 30.0
-COLORS = {"measured": [60, 60, 60], "before": [200, 85, 61], "after": [42, 127, 158]}
+COLORS = {"measured": [150, 150, 150], "before": [200, 85, 61], "after": [42, 127, 158]}
 
 
 def write_recording(diagnosis: Diagnosis, path: Path) -> None:
@@ -33,9 +33,8 @@ def write_recording(diagnosis: Diagnosis, path: Path) -> None:
 
 def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     joints = _worst_joints(diagnosis)
-    torques = [
-        rrb.TimeSeriesView(origin=f"torque/{name}", name=f"{name}: motor torque, N m") for name in joints
-    ]
+    torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, N m")]
+    torques += [rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, N m") for name in joints]
     responses = [
         rrb.Spatial2DView(origin=f"frf/{name}", name=f"{name}: log FRF") for name in joints[:2] if diagnosis.frf
     ]
@@ -49,12 +48,12 @@ def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
 
 
 def _worst_joints(diagnosis: Diagnosis) -> list[str]:
-    """Three joints with the largest relative torque error of the baseline."""
+    """Three joints with the largest relative torque error of the baseline, worst first."""
     if not diagnosis.traces:
         return list(diagnosis.joints[:3])
     t = diagnosis.traces[0]
     error = (t.measured - t.before).std(axis=0) / np.maximum(t.measured.std(axis=0), 1e-9)
-    return [diagnosis.joints[j] for j in np.sort(np.argsort(-error)[:3])]
+    return [diagnosis.joints[j] for j in np.argsort(-error)[:3]]
 
 
 def _markdown(diagnosis: Diagnosis) -> str:
@@ -77,6 +76,11 @@ def _log_torques(stream: rr.RecordingStream, trace: TorqueTrace, joints: tuple[s
             entity = f"torque/{name}/{kind}"
             stream.log(entity, rr.SeriesLines(colors=COLORS[kind], names=kind, widths=1.5), static=True)
             stream.send_columns(entity, times, rr.Scalars.columns(scalars=values[::step, j]))
+        for kind, values in (("before", trace.before), ("after", trace.after)):
+            entity = f"error/{name}/{kind}"
+            stream.log(entity, rr.SeriesLines(colors=COLORS[kind], names=kind, widths=1.5), static=True)
+            error = (trace.measured - values)[::step, j]
+            stream.send_columns(entity, times, rr.Scalars.columns(scalars=error))
 
 
 def _log_arm(stream: rr.RecordingStream, diagnosis: Diagnosis, trace: TorqueTrace) -> None:
@@ -111,7 +115,7 @@ def _log_meshes(stream: rr.RecordingStream, robot) -> bool:
     """Collision meshes under the joint frames that carry them; False where a file is missing."""
     try:
         full = pin.buildModelFromUrdf(str(robot.urdf))
-        shapes = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.COLLISION, str(robot.mesh_dir or robot.folder))
+        shapes = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=[str(robot.mesh_dir or robot.folder)])
     except Exception:
         return False
     found = False
