@@ -1,0 +1,51 @@
+"""Shared experiments: small, made once per worker."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.dataset_io import load_dataset, save_dataset
+from ident.excitation import make_plan, operating_points
+from robot_assets.robot import load_robot
+from sim import run_experiment
+from sim.experiment import draw_drives
+from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+
+
+def small_plan(robot, seed, *, points=2, levels=(1.0, 0.4), period=2000, validation_points=1, trajectory=False, **kwargs):
+    """A plan of 2 s periods, scaled to the arm."""
+    plant = build_plant(robot)
+    postures = operating_points(robot, points + validation_points, np.random.default_rng(seed))
+    return make_plan(
+        robot,
+        points=points,
+        validation_points=validation_points,
+        levels=levels,
+        seed=seed,
+        period=period,
+        postures=postures,
+        trajectory=trajectory,
+        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
+        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
+        **kwargs,
+    )
+
+
+def through_files(data, folder):
+    """What a user's diagnosis sees: the files alone."""
+    save_dataset(data, folder / "dataset")
+    return load_dataset(folder / "dataset")
+
+
+@pytest.fixture(scope="session")
+def ur10():
+    return load_robot("ur10")
+
+
+@pytest.fixture(scope="session")
+def clean(ur10, tmp_path_factory):
+    """(dataset read from files, true drives): nothing hidden, drives off by up to two."""
+    drives = draw_drives(np.random.default_rng(5), ur10)
+    data = run_experiment(small_plan(ur10, 5, trajectory=True), seed=5, drives=drives)
+    return through_files(data, tmp_path_factory.mktemp("clean")), drives

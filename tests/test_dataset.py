@@ -1,0 +1,178 @@
+"""Dataset files: round trip, and one clear error for everything that breaks the format."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from ident.dataset import Dataset, Segment
+from ident.dataset_io import load_dataset, save_dataset
+from robot_assets.errors import DataError
+
+
+@pytest.fixture
+def folder(tmp_path, ur10):
+    rng = np.random.default_rng(0)
+    N, n = 200, 6
+    common = dict(t=3.0 + np.arange(N) / 1000.0, role="identification")
+    multisine = Segment(
+        name="a", kind="multisine", tau=rng.normal(size=(N, n)), q=rng.normal(size=(N, n)), r=rng.normal(size=(N, n)),
+        operating_point="op01", q0=np.zeros(n), period=100, periods=2, transient_periods=1, experiment=1,
+        realization=1, amplitude=0.5, excited_lines=np.array([3, 5]), **common,
+    )
+    motion = Segment(name="b", kind="trajectory", tau=rng.normal(size=(N, n)), q=rng.normal(size=(N, n)), **common)
+    data = Dataset("small", "ur10", ur10, 1000.0, ur10.joint_names, "zoh", np.full(n, 1e-6), np.full(n, 0.1), None, (multisine, motion))
+    save_dataset(data, tmp_path / "d")
+    return tmp_path / "d", data
+
+
+def test_round_trip(folder):
+    path, data = folder
+    again = load_dataset(path)
+    for a, b in zip(data.segments, again.segments, strict=True):
+        for field in ("t", "tau", "q", "r", "q0", "excited_lines"):
+            x, y = getattr(a, field), getattr(b, field)
+            assert (x is None) == (y is None) and (x is None or np.array_equal(x, y))
+        assert (a.kind, a.role, a.period, a.periods, a.amplitude) == (b.kind, b.role, b.period, b.periods, b.amplitude)
+    assert np.array_equal(again.q_std, data.q_std)
+
+
+def test_csv_is_read(folder):
+    path, data = folder
+    table = pq.read_table(path / "b.parquet")
+    pa.csv.write_csv(table, path / "b.csv")
+    (path / "dataset.toml").write_text((path / "dataset.toml").read_text().replace("b.parquet", "b.csv"))
+    assert np.allclose(load_dataset(path).segments[1].tau, data.segments[1].tau)
+
+
+def _columns(path, change):
+    table = pq.read_table(path / "a.parquet")
+    data = {name: table.column(name).to_numpy().copy() for name in table.column_names}
+    change(data)
+    pq.write_table(pa.table(data), path / "a.parquet")
+
+
+def _drop(data):
+    del data["tau_4"]
+
+
+def _nan(data):
+    data["q_2"][[17, 40]] = np.nan
+
+
+def _infinity(data):
+    data["tau_1"][5] = np.inf
+
+
+def _jitter(data):
+    data["t"][50:] += 0.0004
+
+
+def _rate(data):
+    data["t"] *= 2.0
+
+
+def _short(data):
+    for k in data:
+        data[k] = data[k][:150]
+
+
+def _text(data):
+    data["q_1"] = np.array(["x"] * len(data["t"]))
+
+
+def _huge(data):
+    data["tau_3"][0] = 1e300
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "found"),
+    [
+        (_drop, "tau_4", "no such column"),
+        (_nan, "q_2", "NaN at sample 17 (2"),
+        (_infinity, "tau_1", "infinity at sample 5"),
+        (_jitter, "column t", "sample 49"),
+        (_rate, "column t", "500 Hz"),
+        (_short, "samples", "150"),
+        (_text, "q_1", "string"),
+        (_huge, "tau_3", "1e+300"),
+    ],
+)
+def test_a_broken_file_is_one_clear_error(folder, change, what, found):
+    path, _ = folder
+    _columns(path, change)
+    with pytest.raises(DataError) as caught:
+        load_dataset(path)
+    text = str(caught.value)
+    assert what in text and found in text and "a.parquet" in text and "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("simgap-dataset/1", "simgap-dataset/9", "simgap-dataset/9"),
+        ("excited_lines = [3, 5]", "excited_lines = [3, 50]", "line 50"),
+        ("wrist_3_joint", "wrist_9_joint", "wrist_9_joint"),
+        ('file = "b.parquet"', 'file = "a.parquet"', "second time"),
+        ('file = "b.parquet"', 'file = "../b.parquet"', "../b.parquet"),
+        ('file = "b.parquet"', 'file = "/etc/passwd"', "/etc/passwd"),
+        ('file = "b.parquet"', 'file = "c.parquet"', "no c.parquet"),
+        ("sample_rate = 1000.0", "sample_rate = -1.0", "-1.0"),
+        ("sample_rate = 1000.0", 'sample_rate = "fast"', "fast"),
+        ("period = 100", "period = 90", "200"),
+        ("transient_periods = 1", "transient_periods = 2", "2"),
+        ('kind = "trajectory"', 'kind = "dance"', "dance"),
+        ('robot = "ur10"', 'robot = "ur99"', "no robot.toml"),
+        ('input_hold = "zoh"', 'input_hold = "foh"', "foh"),
+        ("[[segment]]", "[[segment", "invalid TOML"),
+    ],
+)
+def test_a_broken_header_is_one_clear_error(folder, old, new, found):
+    path, _ = folder
+    text = (path / "dataset.toml").read_text()
+    assert old in text
+    (path / "dataset.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(DataError) as caught:
+        load_dataset(path)
+    assert found in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("keep", [0, 3, 100, 2000])
+def test_a_truncated_parquet_file_is_one_clear_error(folder, keep):
+    path, _ = folder
+    file = path / "a.parquet"
+    file.write_bytes(file.read_bytes()[:keep])
+    with pytest.raises(DataError, match=r"a\.parquet"):
+        load_dataset(path)
+
+
+def test_a_duplicate_column_is_refused(folder):
+    path, _ = folder
+    table = pq.read_table(path / "a.parquet")
+    pa.csv.write_csv(table, path / "a.csv")
+    text = (path / "a.csv").read_text().replace('"q_2"', '"q_1"', 1)
+    (path / "a.csv").write_text(text)
+    (path / "dataset.toml").write_text((path / "dataset.toml").read_text().replace("a.parquet", "a.csv"))
+    with pytest.raises(DataError, match="q_1"):
+        load_dataset(path)
+
+
+def test_saving_leaves_a_foreign_folder_alone(folder, tmp_path):
+    _, data = folder
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.txt").write_text("years of work")
+    with pytest.raises(DataError):
+        save_dataset(data, other)
+    assert (other / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_failing_save_harms_no_earlier_dataset(folder):
+    path, data = folder
+    broken = replace(data, segments=(replace(data.segments[0], tau=np.array([["x"]])),))
+    with pytest.raises(ValueError):
+        save_dataset(broken, path)
+    assert len(load_dataset(path).segments) == 2
+    assert not [p for p in path.parent.iterdir() if p.name.startswith(".")]

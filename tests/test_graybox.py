@@ -1,0 +1,85 @@
+"""The linear gray-box against closed forms, finite differences and exact sampling."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
+from robot_assets.robot import Elasticity, load_robot
+
+Q0 = np.array([0.2, -1.2, 0.9, 0.1, 0.5, 0.3])
+
+
+def test_derivatives_match_finite_differences(ur10):
+    structure, par = build_structure(ur10), Parameters.nominal(ur10)
+    lin = linearise(structure, equilibrium(structure, par, Q0))
+    f = np.geomspace(0.5, 80, 30)
+    _, dG = sampled_frf(structure, par, lin, f, 1e-3, "zoh", derivatives=True)
+    x = par.to_log()
+    for c in range(len(x)):
+        h = 1e-5
+        pair = []
+        for sign in (1, -1):
+            moved = x.copy()
+            moved[c] += sign * h
+            pair.append(sampled_frf(structure, par.with_log(moved), lin, f, 1e-3, "zoh")[0])
+        difference = (pair[0] - pair[1]) / (2 * h)
+        assert np.abs(difference - dG[..., c]).max() < 1e-6 * np.abs(dG[..., c]).max()
+
+
+def test_equilibrium_balances_springs_and_gravity(ur10):
+    structure, par = build_structure(ur10), Parameters.nominal(ur10)
+    q = equilibrium(structure, par, Q0)
+    lin = linearise(structure, q)
+    assert np.allclose(par.stiffness * (Q0 - q), lin.g, rtol=1e-9, atol=1e-9)
+    soft = replace(par, stiffness=par.stiffness / 2)
+    assert np.abs(equilibrium(structure, soft, Q0) - Q0).max() > 1.9 * np.abs(q - Q0).max()
+
+
+def test_two_masses_have_the_textbook_resonances():
+    robot = load_robot("twomass")
+    structure, par = build_structure(robot), Parameters.nominal(robot)
+    par = replace(par, damping=np.array([1e-6]), viscous=np.array([1e-6]))
+    lin = linearise(structure, equilibrium(structure, par, np.zeros(1)))
+    k, J_m, J_l = par.stiffness[0], par.inertia[0], lin.M[0, 0]
+    f = np.arange(20.0, 120.0, 0.005)
+    G = np.abs(sampled_frf(structure, par, lin, f, 1e-5, "none")[0][:, 0, 0])
+    assert f[np.argmin(G)] == pytest.approx(np.sqrt(k / J_l) / 2 / np.pi, abs=0.02)
+    assert f[np.argmax(G)] == pytest.approx(np.sqrt(k * (1 / J_m + 1 / J_l)) / 2 / np.pi, abs=0.02)
+
+
+def test_sampling_is_exact(ur10):
+    """Against the matrix exponential of the state-space form under a zero-order hold."""
+    structure, par = build_structure(ur10), Parameters.nominal(ur10)
+    lin = linearise(structure, equilibrium(structure, par, Q0))
+    n, T = 6, 1e-3
+    K, D = np.diag(par.stiffness), np.diag(par.damping)
+    M = scipy.linalg.block_diag(np.diag(par.inertia), lin.M)
+    Kt = np.block([[K, -K], [-K, K + lin.Kg]])
+    Dt = np.block([[D + np.diag(par.viscous), -D], [-D, D]])
+    Mi = np.linalg.inv(M)
+    A = np.block([[np.zeros((12, 12)), np.eye(12)], [-Mi @ Kt, -Mi @ Dt]])
+    B = np.vstack([np.zeros((12, 6)), Mi[:, :6]])
+    E = scipy.linalg.expm(np.block([[A, B], [np.zeros((6, 30))]]) * T)
+    f = np.array([0.5, 3.0, 11.0, 40.0, 70.0, 120.0])
+    for fk, G in zip(f, sampled_frf(structure, par, lin, f, T, "zoh")[0], strict=True):
+        w = 2 * np.pi * fk
+        exact = np.linalg.solve(np.exp(1j * w * T) * np.eye(24) - E[:24, :24], E[:24, 24:])[:n] * -(w**2)
+        assert np.abs(G - exact).max() < 2e-5 * np.abs(exact).max()
+
+
+def test_a_stiff_hinge_changes_nothing_and_a_soft_one_adds_a_resonance(ur10):
+    par, f = Parameters.nominal(ur10), np.geomspace(1, 60, 200)
+
+    def response(stiffness):
+        hinge = Elasticity("extra", "shoulder_lift_joint", (1.0, 0.0, 0.0), stiffness, 1e-3 * stiffness)
+        structure = build_structure(ur10, elasticities=(hinge,))
+        p = replace(par, elastic_stiffness=np.array([stiffness]), elastic_damping=np.array([1e-3 * stiffness]))
+        return sampled_frf(structure, p, linearise(structure, equilibrium(structure, p, Q0)), f, 1e-3, "zoh")[0]
+
+    structure = build_structure(ur10)
+    rigid = sampled_frf(structure, par, linearise(structure, equilibrium(structure, par, Q0)), f, 1e-3, "zoh")[0]
+    assert np.abs(response(1e11) - rigid).max() < 1e-4 * np.abs(rigid).max()
+    assert np.abs(response(2e4) - rigid).max() > 0.05 * np.abs(rigid).max()

@@ -1,0 +1,53 @@
+"""Robot folders."""
+
+import numpy as np
+import pytest
+
+from robot_assets.errors import DataError
+from robot_assets.robot import load_robot
+
+
+def test_ur10_has_the_documented_figures(ur10):
+    assert ur10.n == 6
+    assert ur10.array("stiffness").tolist() == [5e4, 5e4, 2.5e4, 8e3, 8e3, 8e3]
+    assert ur10.array("motor_inertia").tolist() == [2.0, 2.0, 0.9, 0.2, 0.2, 0.2]
+    assert ur10.loads[0].mass == 8.0 and np.allclose(ur10.loads[0].com, [0.03, 0.17, 0.05])
+
+
+def _folder(tmp_path, ur10, old="", new=""):
+    text = (ur10.folder / "robot.toml").read_text()
+    assert old in text
+    (tmp_path / "robot.toml").write_text(text.replace(old, new, 1))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ('name = "elbow_joint"', 'name = "knee"', "knee"),
+        ("stiffness = 5.0e4", "stiffness = -1.0", "-1.0"),
+        ("stiffness = 5.0e4", 'stiffness = "soft"', "soft"),
+        ("motor_inertia = 2.0\n", "", "None"),
+        ("ur10_robot.urdf", "none.urdf", "none.urdf"),
+        ('link = "wrist_3_link"', 'link = "hand"', "hand"),
+        ("[urdf]", "[[[", "invalid TOML"),
+    ],
+)
+def test_a_wrong_robot_is_one_clear_error(tmp_path, ur10, old, new, found):
+    with pytest.raises(DataError) as caught:
+        load_robot(_folder(tmp_path, ur10, old, new))
+    assert found in str(caught.value) and "robot.toml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_an_unknown_robot_lists_the_known_ones():
+    with pytest.raises(DataError, match="ur10"):
+        load_robot("no-such-arm")
+
+
+def test_entities_in_a_urdf_are_refused(tmp_path, ur10):
+    folder = _folder(tmp_path, ur10, 'package = "example-robot-data"\n', "")
+    text = (folder / "robot.toml").read_text().replace("robots/ur_description/urdf/ur10_robot.urdf", "bomb.urdf")
+    (folder / "robot.toml").write_text(text)
+    (folder / "bomb.urdf").write_text('<!DOCTYPE r [<!ENTITY a "aa">]><robot name="&a;"/>')
+    with pytest.raises(DataError, match="entity"):
+        load_robot(folder)
