@@ -12,7 +12,8 @@ import argparse
 import json
 import tempfile
 import time
-from concurrent.futures import Executor, ProcessPoolExecutor
+import traceback
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,7 @@ def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: s
         robot,
         points=2,
         seed=seed,
+        levels=(1.0, 0.4),
         postures=postures,
         inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
         gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
@@ -60,7 +62,11 @@ def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: s
     with tempfile.TemporaryDirectory() as folder:
         save_dataset(data, Path(folder) / "d")
         began = time.perf_counter()
-        result = diagnose_fully(load_dataset(Path(folder) / "d"))
+        try:
+            result = diagnose_fully(load_dataset(Path(folder) / "d"))
+        except Exception as err:
+            where = traceback.extract_tb(err.__traceback__)[-1]
+            return {"seed": seed, "truth": truth, "error": f"{type(err).__name__}: {err} in {where.name}:{where.lineno}"}
     v = result.verdict.to_dict()
     return {
         "seed": seed,
@@ -100,15 +106,15 @@ def judge(row: dict) -> dict:
 
 
 def run(cases: list[tuple], executor: Executor) -> list[dict]:
-    """All cases, in order, on any executor."""
+    """All cases on any executor; sorted by seed, so that the order of completion does not matter."""
     futures = [executor.submit(run_case, *case) for case in cases]
     rows = []
-    for future in futures:
+    for future in as_completed(futures):
         row = future.result()
         row["judged"] = judge(row)
         rows.append(row)
         print(line(row), flush=True)
-    return rows
+    return sorted(rows, key=lambda r: r["seed"])
 
 
 def line(row: dict) -> str:
