@@ -36,10 +36,6 @@ def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: s
     rng = np.random.default_rng(seed)
     robot = load_robot(robot_name)
     pool = names or tuple(EFFECTS)
-    hidden = []
-    for i in range(count):
-        name = pool[(seed + i * 7) % len(pool)]
-        hidden.append(draw_effect(rng, robot, names=(name,), strength=float(np.exp(rng.uniform(-0.5, 0.7)))))
     plant = build_plant(robot)
     postures = operating_points(robot, 3, rng)
     plan = make_plan(
@@ -52,6 +48,12 @@ def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: s
         gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
         period=int(rng.choice([3000, 4000])),
     )
+    peak = np.max([np.abs(e.r).max(axis=0) for e in plan.experiments], axis=0)
+    peak = peak + np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0)
+    hidden = []
+    for i in range(count):
+        name = pool[(seed + i * 7) % len(pool)]
+        hidden.append(draw_effect(rng, robot, names=(name,), strength=float(np.exp(rng.uniform(-0.5, 0.7))), peak_torque=peak))
     truth = [{"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e))} for e in hidden]
     began = time.perf_counter()
     try:

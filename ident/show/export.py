@@ -16,6 +16,8 @@ from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
 
 TIMESTEP = 2.5e-4
+ROTOR_MASS = 1e-3  # kg, of a sphere of 50 mm: a body must have a mass; its inertia is taken off the armature
+ROTOR_BODY = 0.4 * ROTOR_MASS * 0.05**2
 
 
 def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
@@ -128,12 +130,11 @@ def _add_bodies(spec: mujoco.MjSpec, model: pin.Model, springs: dict[str, Elasti
 
 def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> None:
     rotor = spec.worldbody.add_body(name=f"rotor:{name}")
-    rotor.explicitinertial = True
-    rotor.mass, rotor.inertia = 1e-6, [1e-10] * 3
+    rotor.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.05, 0, 0], mass=ROTOR_MASS, contype=0, conaffinity=0, rgba=[0, 0, 0, 0])
     rotor.add_joint(
         name=f"motor:{name}",
         axis=[0, 0, 1],
-        armature=parameters[f"motor_inertia.{name}"],
+        armature=max(parameters[f"motor_inertia.{name}"] - ROTOR_BODY, 0.0),
         damping=[parameters[f"viscous_friction.{name}"], 0, 0],
     )
     gear = spec.add_tendon(name=f"gear:{name}")

@@ -130,16 +130,21 @@ def draw_effect(
     names: Sequence[str] | None = None,
     strength: float = 1.0,
     place: str | None = None,
+    peak_torque: np.ndarray | None = None,
 ) -> object:
     """An effect of random kind, place and size, clearly seen in an experiment of default size.
 
     Args:
         strength: factor on the size.
+        peak_torque: (n,) torque that the experiment reaches, N m, for limits that are to be met.
     """
     name = str(rng.choice(list(names or EFFECTS)))
     place = place or str(rng.choice(valid_places(name, robot)))
     joint = robot.joints[robot.joint_names.index(place)] if place in robot.joint_names else robot.joints[0]
     size = strength * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
+    peak = 0.5 * joint.torque_limit
+    if peak_torque is not None and place in robot.joint_names:
+        peak = float(peak_torque[robot.joint_names.index(place)])
     torque = 0.02 * joint.torque_limit * size
     delta = 0.05 * joint.torque_limit / joint.stiffness
     phase = float(rng.uniform(-np.pi, np.pi))
@@ -156,7 +161,7 @@ def draw_effect(
         "torque_constant": {"scale": 1 + 0.08 * size * float(rng.choice([-1, 1]))},
         "torque_lag": {"time_constant": 1e-3 * size},
         "torque_delay": {"delay": 1e-3 * size},
-        "torque_saturation": {"limit": 0.2 * joint.torque_limit / size},
+        "torque_saturation": {"limit": peak * (0.75 - 0.1 * min(size, 2.0))},
         "hardening_stiffness": {"cubic": 0.3 * size * k / delta**2},
         "softening_stiffness": {"low_stiffness": k / (1 + size), "transition": delta},
         "backlash": {"gap": delta * size},

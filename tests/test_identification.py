@@ -1,0 +1,85 @@
+"""Identification of drives that are off by up to a factor of two, from files."""
+
+import numpy as np
+import pytest
+
+from ident.attribute import discrepancy_p_value
+from ident.diagnose import diagnose, identify
+from ident.estimate import ESTIMATORS, fit_frf
+from ident.extended import predict
+from ident.frf import estimate_frf
+from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
+
+FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
+
+
+@pytest.fixture(scope="module")
+def identified(clean):
+    return identify(clean[0])
+
+
+def relative_errors(par, drives):
+    truth = np.concatenate([drives[f] for f in FIELDS])
+    return np.exp(par.to_log()) / truth - 1
+
+
+def test_the_true_drives_are_found_with_honest_intervals(clean, identified):
+    _, result = identified
+    error = relative_errors(result.model.par, clean[1])
+    std = np.sqrt(np.diag(result.covariance()))[:24]
+    assert np.abs(error[:6]).max() < 0.005 and np.abs(error[12:18]).max() < 0.005
+    assert np.abs(error[6:12]).max() < 0.05 and np.abs(error[18:]).max() < 0.05
+    assert np.mean(np.abs(error) < 1.96 * std) >= 0.75
+    assert 0.8 < result.chi2_per_dof < 1.25
+
+
+def test_held_out_data_are_predicted_to_the_noise(clean, identified):
+    setup, result = identified
+    for group in setup.held_out:
+        pred = predict(result.model, group, setup.problem.sampling)
+        e = group.observe(group.U - pred.U)
+        share = np.sqrt(np.mean(np.abs(e) ** 2) / np.mean(np.abs(group.observe(group.U)[:, 1:]) ** 2))
+        assert share < 0.02
+
+
+def test_nothing_hidden_nothing_named(clean):
+    verdict = diagnose(clean[0])
+    assert not verdict.discrepancy.detected and not verdict.causes
+    assert verdict.unexplained_verdict == "noise floor reached"
+    assert verdict.gain.after == verdict.gain.before
+
+
+def test_the_p_value_is_that_of_chance(identified):
+    assert discrepancy_p_value(identified[1]) > 1e-4 or identified[1].chi2_per_dof < 1.1
+
+
+def test_measured_frfs_agree_with_the_true_arm(clean):
+    data, drives = clean
+    frf = estimate_frf(data)
+    structure = build_structure(data.robot)
+    par = Parameters.nominal(data.robot).with_log(np.log(np.concatenate([drives[f] for f in FIELDS])))
+    for i in range(len(frf.operating_points)):
+        lin = linearise(structure, equilibrium(structure, par, frf.q0[i]))
+        G, _ = sampled_frf(structure, par, lin, frf.frequency, 1e-3, "zoh")
+        error = np.abs(frf.G[i] - G) / np.abs(G).max(axis=(1, 2), keepdims=True)
+        assert np.median(error) < 0.01
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_every_frf_estimator_finds_the_drives(clean, estimator):
+    data, drives = clean
+    result = fit_frf(
+        build_structure(data.robot), estimate_frf(data), Parameters.nominal(data.robot), sample_time=1e-3, hold="zoh", estimator=estimator, starts=(Parameters.nominal(data.robot),)
+    )
+    error = np.abs(relative_errors(result.parameters, drives))
+    limit = 0.02 if estimator in ("nls", "lls") else 0.005
+    assert error[:6].max() < limit and error[12:18].max() < limit
+    assert np.median(error) < 0.01
+
+
+@pytest.mark.parametrize("estimator", ["h1", "jio", "ari", "har", "log"])
+def test_the_five_averages_agree_on_quiet_data(clean, estimator):
+    reference = estimate_frf(clean[0], estimator="ari")
+    other = estimate_frf(clean[0], estimator=estimator)
+    scale = np.abs(reference.G).max(axis=(2, 3), keepdims=True)
+    assert np.median(np.abs(other.G - reference.G) / scale) < 0.01

@@ -1,0 +1,86 @@
+"""The plant against closed forms and against its own description."""
+
+import numpy as np
+import pytest
+
+from robot_assets.errors import DataError
+from robot_assets.robot import load_robot
+from sim import EFFECTS, draw_effect, parse_effect, run_experiment
+from sim.effects import parameters_of, valid_places
+from sim.plant import build_plant, gravity_torque, rest
+from tests.conftest import small_plan
+
+
+def test_rest_sags_by_torque_over_stiffness(ur10):
+    plant = build_plant(ur10)
+    q = np.array([0.2, -1.2, 0.9, 0.1, 0.5, 0.3])
+    x, hold = rest(plant, q)
+    assert np.allclose(x[plant.motor], q)
+    assert np.allclose(ur10.array("stiffness") * (q - x[plant.link]), hold, rtol=1e-6, atol=1e-6)
+    assert np.abs(hold - gravity_torque(plant, q)).max() < 1.0
+
+
+def test_two_masses_resonate_where_they_should():
+    robot = load_robot("twomass")
+    plan = small_plan(robot, 0, points=1, levels=(1.0,), validation_points=0, sample_rate=2500.0, period=2500, band_hz=(20.0, 120.0), periods=4, transient_periods=2)
+    drives = {"damping": np.array([2e-3]), "viscous_friction": np.array([1e-3])}
+    s = run_experiment(plan, drives=drives, noise=0.0, timestep=1e-4).segments[0]
+    U, Y = (np.fft.rfft(s.periodic(c)[0, :, 0])[s.excited_lines] for c in ("tau", "q"))
+    f = s.excited_lines * 1.0
+    gain = np.abs(Y / U) * f**2
+    k, J_m, J_l = 400.0, 0.004, 0.00477
+    assert f[np.argmin(gain)] == pytest.approx(np.sqrt(k / J_l) / 2 / np.pi, abs=2.0)
+    assert f[np.argmax(gain)] == pytest.approx(np.sqrt(k * (1 / J_m + 1 / J_l)) / 2 / np.pi, abs=2.0)
+
+
+def test_seeds_repeat_and_differ():
+    robot = load_robot("twomass")
+    plan = small_plan(robot, 0, points=1, levels=(1.0,), validation_points=0, period=500)
+    a, b, c = (run_experiment(plan, seed=s).segments[0].tau for s in (1, 1, 2))
+    assert np.array_equal(a, b) and not np.array_equal(a, c)
+
+
+def test_steady_state_is_reached_after_the_transient(clean):
+    data, _ = clean
+    s = data.segments[0]
+    periods = s.q.reshape(s.periods, s.period, -1)
+    scatter = np.abs(periods[1] - periods[2]).max(axis=0)
+    assert np.all(scatter < 60 * data.robot.array("q_std"))
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_every_effect_changes_the_data_and_stays_bounded(name):
+    robot = load_robot("ur10")
+    plan = small_plan(robot, 1, points=1, levels=(1.0,), validation_points=0, period=500, periods=2, band_hz=(2.0, 60.0))
+    peak = np.max([np.abs(e.r).max(axis=0) for e in plan.experiments], axis=0)
+    effect = draw_effect(
+        np.random.default_rng(3), robot, names=(name,), place=valid_places(name, robot)[0], peak_torque=peak
+    )
+    still = run_experiment(plan, noise=0.0)
+    moved = run_experiment(plan, [effect], noise=0.0)
+    change = max(np.abs(a.q - b.q).max() for a, b in zip(still.segments, moved.segments, strict=True))
+    assert 1e-6 < change < 1.0
+
+
+def test_an_effect_is_read_from_text(ur10):
+    effect = parse_effect("coulomb_friction@elbow_joint:torque=3,asymmetry=0.1", ur10)
+    assert effect.place == "elbow_joint" and parameters_of(effect) == {"torque": 3.0, "asymmetry": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("magic@elbow_joint:torque=3", "magic"),
+        ("cogging@knee:amplitude=1", "knee"),
+        ("cogging@elbow_joint:size=1", "size"),
+        ("cogging@elbow_joint:amplitude=big", "big"),
+        ("torque_delay@elbow_joint", None),
+        ("nonsense", "nonsense"),
+    ],
+)
+def test_a_wrong_effect_is_one_clear_error(ur10, text, found):
+    if found is None:
+        assert parse_effect(text, ur10).delay > 0
+        return
+    with pytest.raises(DataError, match=found):
+        parse_effect(text, ur10)
