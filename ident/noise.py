@@ -104,7 +104,9 @@ def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndar
     columns[:, k, k] = 1.0
     columns[:, :, n:] = gain
     floor = 1e-12 * np.maximum(power.mean(axis=0), 1e-300)
-    weight = 1.0 / np.maximum(power.mean(axis=0), 1e-300) * np.ones_like(power)
+    # Relative errors count: the first weights are those of a running mean, the next of the model.
+    local = _moving_mean(power[:, :, None], 15)[0][:, :, 0]
+    weight = 1.0 / np.maximum(local, floor + 1e-300)
     level = np.zeros(2 * n)
     for _ in range(4):
         A = (columns * weight[..., None])[1:].reshape(-1, 2 * n)
@@ -112,7 +114,7 @@ def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndar
         size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         level = scipy.optimize.nnls(A / size, b)[0] / size
         model = columns @ level + floor
-        weight = 1.0 / model
+        weight = 1.0 / np.maximum(model, 0.1 * local)
     return level[:n] + floor, level[n:] + 1e-12 * floor
 
 

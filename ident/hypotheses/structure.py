@@ -174,9 +174,9 @@ def link_inertia(link: str, joint_index: int) -> Hypothesis:
 
     def responses(structure, par, plane, group, solution, shape):
         joint, _ = structure.bodies[link]
-        own = build_structure(structure.robot, scale_links={link: 2.0}).model.inertias[joint]
-        base = build_structure(structure.robot).model.inertias[joint]
-        column = own.toDynamicParameters() - base.toDynamicParameters()
+        single, double = (build_structure(structure.robot, scale_links={link: f}) for f in (1.0, 2.0))
+        body = single.bodies[link][0]
+        column = double.model.inertias[body].toDynamicParameters() - single.model.inertias[body].toDynamicParameters()
         return [_inertial_response(structure, joint, pin.SE3.Identity(), column, plane, group, solution)]
 
     return Hypothesis(

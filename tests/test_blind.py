@@ -1,0 +1,66 @@
+"""Effects drawn by a seed and hidden in the plant; the diagnosis sees the files alone."""
+
+import numpy as np
+import pytest
+
+from ident.diagnose import diagnose
+from sim import draw_effect, run_experiment
+from sim.effects import parameters_of
+from sim.experiment import draw_drives
+from tests.conftest import small_plan, through_files
+
+CASES = {
+    "coulomb_friction": ("torque",),
+    "cogging": ("amplitude", "periods_per_rev"),
+    "torque_constant": ("scale",),
+    "torque_delay": ("delay",),
+    "hardening_stiffness": ("cubic",),
+    "payload": ("mass",),
+}
+
+
+def hide(robot, name, seed, folder):
+    """A dataset with one effect of a kind; place, size and drives drawn."""
+    rng = np.random.default_rng(seed)
+    effect = draw_effect(rng, robot, names=(name,))
+    data = run_experiment(
+        small_plan(robot, seed, levels=(1.0, 0.6, 0.3)), [effect], seed=seed, drives=draw_drives(rng, robot)
+    )
+    return effect, through_files(data, folder)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_hidden_effect_is_found(ur10, tmp_path, name):
+    effect, data = hide(ur10, name, 40 + list(CASES).index(name), tmp_path)
+    verdict = diagnose(data)
+    assert verdict.discrepancy.detected
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [(effect.name, effect.place)]
+    found, truth = verdict.causes[0].parameters, parameters_of(effect)
+    for key in CASES[name]:
+        assert found[key].value == pytest.approx(truth[key], rel=0.15)
+    assert verdict.gain.gap_closed > 0.85 and verdict.gain.after < verdict.gain.before
+
+
+def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path):
+    from dataclasses import dataclass
+
+    from sim.effects.effect import Torque
+
+    @dataclass(frozen=True)
+    class Drag:
+        """Quadratic drag, which the catalogue lacks."""
+
+        place: str
+        coefficient: float
+
+        def torque(self, run):
+            j = run.joint(self.place)
+            return lambda x: Torque(j, -self.coefficient * x.v[:, j] * np.abs(x.v[:, j]))
+
+    drives = draw_drives(np.random.default_rng(3), ur10)
+    data = run_experiment(small_plan(ur10, 3), [Drag("elbow_joint", 60.0)], seed=3, drives=drives)
+    verdict = diagnose(through_files(data, tmp_path))
+    assert verdict.discrepancy.detected
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    assert all(c.probability <= 0.5 for c in verdict.causes)
+    assert "elbow_joint" in verdict.residual_description
