@@ -25,6 +25,7 @@ DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 REFITS = 8  # candidates refitted in a round
+POLISH_STEPS = 15  # of the winner of a round
 PER_EFFECT = 2  # of one effect, at most
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
@@ -71,7 +72,7 @@ class Attribution:
     def left_share(self) -> float:
         """Share of the discrepancy (excess over noise) that no cause explains."""
         before = max(self.baseline.chi2_per_dof - 1.0, 1e-12)
-        return float(np.clip((self.final.chi2_per_dof - 1.0) / before, 0.0, 1.0))
+        return float(np.clip((self.final.chi2_per_dof - DETECTION_EXCESS) / before, 0.0, 1.0))
 
 
 def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None) -> Fit:
@@ -136,10 +137,23 @@ def attribute(
             rounds.append(found)
             break
         rounds.append(found)
-        current = best.fit
+        current = polish(problem, best.fit)
         taken = {e.hypothesis.key for e in current.model.effects}
         hypotheses = tuple(h for h in hypotheses if h.key not in taken)
     return Attribution(baseline, detected, p_value, tuple(rounds), current, unknown)
+
+
+def polish(problem: Problem, result: Fit) -> Fit:
+    """The winner fitted to the end."""
+    names = parameter_names(problem.structure.robot)
+    return fit(
+        problem,
+        result.model,
+        base_names=names,
+        iterations=POLISH_STEPS,
+        weights=result.weights,
+        remainders=result.remainders,
+    )
 
 
 def attribute_once(

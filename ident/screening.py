@@ -206,8 +206,8 @@ def position_lines(
     weights of their own in every posture, so that no phase has to be carried between postures;
     then the best ones are refined with one phase for all.
     """
-    qs, rs = [], []
-    for group, pred in zip(problem.groups, predictions, strict=True):
+    qs, rs, groups = [], [], []
+    for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
         motion = pred.motion(group)
         q = motion.q(joint)
         R = (group.U - pred.U)[..., joint : joint + 1].copy()
@@ -223,10 +223,13 @@ def position_lines(
             x = r[s, ::step]
             qs.append((q[s, ::step], nuisance))
             rs.append(x - nuisance @ (nuisance.T @ x))
+            groups.append(g)
     spans = [np.ptp(q) for q, _ in qs]
     if max(spans) <= 0:
         return ()
-    loudest = np.argsort([-float(r @ r) for r in rs])[:PERIODOGRAM_RECORDS]
+    order = np.argsort([-float(r @ r) for r in rs])
+    each = max(2, PERIODOGRAM_RECORDS // len(problem.groups))
+    loudest = [i for g in range(len(problem.groups)) for i in [k for k in order if groups[k] == g][:each]]
     qs, rs = [qs[i] for i in loudest], [rs[i] for i in loudest]
     spans = [spans[i] for i in loudest]
     coarse = np.arange(1.0, 260.0) * (0.7 * np.pi / max(spans))
@@ -246,19 +249,33 @@ def position_lines(
             best.append(float(coarse[k]))
         if len(best) == count or power[k] < 1e-3 * total:
             break
-    return tuple(_refine(qs, rs, n, coarse[1] - coarse[0]) for n in best)
+    return tuple(f for n in best for f in _refine(qs, rs, n, coarse[1] - coarse[0]))
 
 
-def _refine(qs, rs, center: float, width: float) -> float:
-    """Best wave number near ``center`` with one phase for all records."""
+def _refine(qs, rs, center: float, width: float, count: int = 4) -> list[float]:
+    """Best wave numbers near ``center`` with one phase for all records.
+
+    Postures far apart leave a comb of nearly equal maxima; the best of them are all returned.
+    """
     spread = np.ptp([q.mean() for q, _ in qs]) + np.ptp(qs[0][0])
     fine = np.linspace(center - 1.5 * width, center + 1.5 * width, int(np.clip(6 * width * spread, 41, 1500)))
+    power = _coherent_power(qs, rs, fine)
+    peaks = np.flatnonzero((power >= np.roll(power, 1)) & (power >= np.roll(power, -1)))
+    out = []
+    for k in peaks[np.argsort(-power[peaks])][:count]:
+        near = fine[k] + (fine[1] - fine[0]) * np.linspace(-1, 1, 41)
+        out.append(float(near[np.argmax(_coherent_power(qs, rs, near))]))
+    return out
+
+
+def _coherent_power(qs, rs, wave_numbers: np.ndarray) -> np.ndarray:
+    """Fall of the squared residual by a sine and a cosine of each wave number."""
     cc = ss = cs = y1 = y2 = 0.0
-    for (q, N), r in zip(qs, rs, strict=True):
+    for (q, _), r in zip(qs, rs, strict=True):
         stride = max(1, len(q) // 250)
-        E = np.exp(1j * np.outer(q[::stride], fine))
+        E = np.exp(1j * np.outer(q[::stride], wave_numbers))
         c, s, x = E.real, E.imag, r[::stride]
         cc, ss, cs = cc + (c * c).sum(0), ss + (s * s).sum(0), cs + (c * s).sum(0)
         y1, y2 = y1 + c.T @ x, y2 + s.T @ x
     det = np.maximum(cc * ss - cs**2, 1e-300)
-    return float(fine[np.argmax((ss * y1**2 - 2 * cs * y1 * y2 + cc * y2**2) / det)])
+    return (ss * y1**2 - 2 * cs * y1 * y2 + cc * y2**2) / det

@@ -1,7 +1,7 @@
 """Laws with memory, stepped along time in compiled code.
 
 Each takes (S, T) signals over one period and returns the periodic steady state: the period is run
-twice and the second pass is kept.
+again until it repeats (friction elements forget in one).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+SWEEPS = 25  # periods at most until the steady state
 CUBIC, BACKLASH, SOFTENING, HYSTERESIS = 0, 1, 2, 3
 
 
@@ -93,7 +94,7 @@ def spring_loop(
     """
     S, T = linear.shape
     modes = len(decay)
-    out = np.empty((S, T))
+    out = np.zeros((S, T))
     direct = 0.0
     for m in range(modes):
         direct += gain_new[m].real
@@ -102,7 +103,9 @@ def spring_loop(
         x[:] = 0.0
         h = spring_torque(code, a, b, k, linear[i, T - 1], linear[i, T - 1], 0.0)
         delta = linear[i, T - 1]
-        for sweep in range(2):
+        for sweep in range(SWEEPS):
+            change = 0.0
+            largest = 0.0
             for t in range(T):
                 free = linear[i, t]
                 for m in range(modes):
@@ -117,7 +120,11 @@ def spring_loop(
                     x[m] += gain_new[m] * h_new
                 delta = guess
                 h = h_new
+                change = max(change, abs(h - out[i, t]))
+                largest = max(largest, abs(h))
                 out[i, t] = h
+            if sweep > 0 and change <= 1e-5 * largest:
+                break
     return out
 
 
