@@ -22,7 +22,7 @@ CASES = {
 def hide(robot, name, seed, folder):
     """A dataset with one effect of a kind; place, size and drives drawn."""
     rng = np.random.default_rng(seed)
-    effect = draw_effect(rng, robot, names=(name,))
+    effect = draw_effect(rng, robot, names=(name,), strength=2.0)
     data = run_experiment(
         small_plan(robot, seed, levels=(1.0, 0.6, 0.3)), [effect], seed=seed, drives=draw_drives(rng, robot)
     )

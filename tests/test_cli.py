@@ -1,0 +1,87 @@
+"""The command line as a user calls it."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from ident.dataset_io import save_dataset
+
+
+def simgap(*args, timeout=300):
+    return subprocess.run([sys.executable, "-m", "ident.cli", *map(str, args)], capture_output=True, text=True, timeout=timeout, check=False)
+
+
+@pytest.fixture(scope="module")
+def dataset(clean, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cli") / "d"
+    save_dataset(clean[0], folder)
+    return folder
+
+
+def test_check_says_what_a_dataset_holds(dataset):
+    run = simgap("check", dataset)
+    assert run.returncode == 0 and "elbow_joint" in run.stdout and not run.stderr
+    report = json.loads(simgap("check", dataset, "--json").stdout)
+    assert report["joints"][2] == "elbow_joint" and report["levels"] == [1.0, 0.4]
+
+
+def test_frf_and_identify_write_their_files(dataset, tmp_path):
+    run = simgap("frf", dataset, "--out", tmp_path / "frf", "--json")
+    assert run.returncode == 0 and json.loads(run.stdout)["median_relative_std"] < 0.1
+    assert (tmp_path / "frf" / "frf.npz").is_file()
+    run = simgap("identify", dataset, "--out", tmp_path / "id", "--estimator", "ml", "--json")
+    assert run.returncode == 0
+    assert json.loads(run.stdout) == json.loads((tmp_path / "id" / "parameters.json").read_text())
+
+
+def test_diagnose_writes_everything(dataset, tmp_path):
+    run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--json", "--quiet")
+    assert run.returncode == 0 and not run.stderr
+    assert json.loads(run.stdout) == json.loads((tmp_path / "out" / "verdict.json").read_text())
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"verdict.json", "report.html", "recording.rrd", "model.toml", "model.xml"}
+
+
+def test_experiment_writes_a_dataset_that_checks(tmp_path):
+    run = simgap("experiment", "twomass", "--out", tmp_path / "d", "--effect", "coulomb_friction@drive:torque=0.3", "--points", 1, "--quiet")
+    assert run.returncode == 0, run.stderr
+    assert simgap("check", tmp_path / "d").returncode == 0
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("check", "no-such-folder"),
+        ("diagnose", "no-such-folder", "--out", "out"),
+        ("diagnose",),
+        ("experiment", "ur99", "--out", "d"),
+        ("experiment", "ur10", "--out", "d", "--effect", "magic@elbow_joint"),
+        ("experiment", "ur10", "--out", "d", "--points", "0"),
+        ("show", "no-such-folder"),
+        ("demo", "--out", "d", "--real", "nothing"),
+        ("dance",),
+    ],
+    ids=lambda a: "-".join(a[:2]),
+)
+def test_bad_usage_is_one_line_and_status_two(args, tmp_path):
+    run = subprocess.run([sys.executable, "-m", "ident.cli", *args], capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path)
+    assert run.returncode == 2, run.stderr
+    assert len(run.stderr.strip().splitlines()) == 1 and "Traceback" not in run.stderr
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_robot_that_does_not_match_is_one_line_and_overwrites_nothing(dataset, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "verdict.json").write_text("earlier")
+    toml = dataset / "dataset.toml"
+    text = toml.read_text()
+    try:
+        toml.write_text(text.replace('robot = "ur10"', 'robot = "twomass"'))
+        run = simgap("diagnose", dataset, "--out", out)
+    finally:
+        toml.write_text(text)
+    assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1
+    assert "shoulder_pan_joint" in run.stderr and "drive" in run.stderr
+    assert (out / "verdict.json").read_text() == "earlier"
