@@ -212,7 +212,7 @@ def make_verdict(
         causes.append(_cause(effect, candidates, final, covariance, trust))
     verdict = "unknown cause remains" if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)
-    description = describe(setup.problem, last) if unknown else None
+    description = describe(setup.problem, final, last) if unknown else None
     return Verdict(
         dataset=dataset.name,
         baseline=values,

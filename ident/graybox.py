@@ -13,7 +13,7 @@ couple joints. All drive figures are referred to the link side of the gear.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
@@ -34,6 +34,7 @@ class Structure:
         elastic: (n_e,) indices of the elastic hinges.
         bodies: link name -> (Pinocchio joint index, placement of the link frame in it).
         robot: the robot it was built from.
+        hinges, loads, scale_links: what ``build_structure`` was given beyond the robot.
     """
 
     model: pin.Model
@@ -41,6 +42,9 @@ class Structure:
     elastic: np.ndarray
     bodies: dict[str, tuple[int, pin.SE3]]
     robot: Robot
+    hinges: tuple[Elasticity, ...] = ()
+    loads: tuple[tuple[str, pin.Inertia], ...] = ()
+    scale_links: dict[str, float] = field(default_factory=dict)
 
     @property
     def n(self) -> int:
@@ -196,7 +200,9 @@ def build_structure(
     elastic = np.array(
         [model.idx_vs[model.getJointId(_hinge_name(h))] for h in hinges], dtype=int
     )
-    return Structure(model, driven, elastic, bodies, robot)
+    return Structure(
+        model, driven, elastic, bodies, robot, tuple(elasticities), tuple(loads), dict(scale_links or {})
+    )
 
 
 def equilibrium(structure: Structure, par: Parameters, q_m: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ from ident.graybox import (
 )
 from ident.records import Group
 
-REMAINDER_STEPS = 40  # fixed-point steps at most for the geometric remainder from a cold start
+REMAINDER_STEPS = 200  # fixed-point steps at most for the geometric remainder from a cold start
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
 
 
@@ -241,11 +241,15 @@ def solve(
         Q = true_position(group, par, sampling)
     if W is None:
         W = static_remainder(structure, par, plane, group)
+    relaxation, last = 1.0, np.inf
     for _ in range(steps):
         Q_a = link_motion(structure, par, plane, Q, W, torques)
-        W_next = geometric_remainder(structure, plane, group, Q_a)
-        change, W = np.abs(W_next - W).max(), W_next
-        if change < REMAINDER_CHANGE * np.abs(W).max():
+        step = geometric_remainder(structure, plane, group, Q_a) - W
+        change = float(np.sqrt(np.sum(np.abs(step) ** 2)))
+        # A large motion near a resonance of the links can overshoot: then smaller steps.
+        relaxation = max(0.5 * relaxation, 0.1) if change > 0.95 * last else relaxation
+        W, last = W + relaxation * step, change
+        if np.abs(step).max() < REMAINDER_CHANGE * np.abs(W).max():
             break
     Q_a = link_motion(structure, par, plane, Q, W, torques)
     delta = Q @ par.coupling.T - Q_a[..., structure.driven]

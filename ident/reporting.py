@@ -177,15 +177,15 @@ def evidence_plot(problem: Problem, fit: Fit, predictions: Sequence[Prediction],
     return EvidencePlot(index, f"{h.effect.replace('_', ' ')} at {h.place}", label, f"residual torque of {joint}, N m", x, y, x[order], m[order])
 
 
-def describe(problem: Problem, predictions: Sequence[Prediction]) -> str:
+def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> str:
     """Where an unexplained residual sits: joint, band, growth with level, best variable."""
     n = problem.structure.n
     power, band = np.zeros(n), None
     levels: dict[float, list[float]] = {}
     spectra = []
-    for group, pred in zip(problem.groups, predictions, strict=True):
+    for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
         e = np.abs(residual(group, pred)) ** 2
-        power += e.sum(axis=(0, 1))
+        power += np.sum(fit.weights.apply(g, residual(group, pred)) ** 2, axis=(0, 1, 2))
         spectra.append((group.omega[group.keep] / 2 / np.pi, e.sum(axis=0)))
         for s, level in enumerate(group.amplitude):
             levels.setdefault(float(level), []).append(float(e[s].sum()))

@@ -56,11 +56,14 @@ def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple
     if change == Change():
         return structure, par
     if change.elasticities or change.loads or change.scale_links:
+        scales = dict(structure.scale_links)
+        for link, factor in change.scale_links:
+            scales[link] = scales.get(link, 1.0) * factor
         structure = build_structure(
             structure.robot,
-            elasticities=change.elasticities,
-            loads=change.loads,
-            scale_links=dict(change.scale_links),
+            elasticities=structure.hinges + change.elasticities,
+            loads=structure.loads + change.loads,
+            scale_links=scales,
         )
     coupling = par.coupling.copy()
     for row, column, ratio in change.coupling:
