@@ -7,8 +7,6 @@ All drive figures are referred to the link side of the gear.
 from __future__ import annotations
 
 import sysconfig
-import tomllib
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from robot_assets.errors import DataError
+from robot_assets.urdf import read_urdf
+from robot_assets.values import exists, number, read_toml, show, subtable, tables, text, vector
 
 ASSETS = Path(__file__).parent
 
@@ -107,44 +107,46 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     """
     folder = _folder(name_or_path, relative_to)
     path = folder / "robot.toml"
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as err:
-        raise DataError("robot", str(path), str(err), "a readable robot.toml") from err
-    except tomllib.TOMLDecodeError as err:
-        raise DataError("robot", str(path), f"invalid TOML ({err})", "valid TOML") from err
-    urdf, mesh_dir = _urdf(data.get("urdf"), folder, path)
-    joints = tuple(_joint(entry, i, path) for i, entry in enumerate(_tables(data, "joint", path)))
+    where = str(path)
+    data = read_toml(path, "robot")
+    urdf, mesh_dir = _urdf(data.get("urdf"), folder, where)
+    tree = read_urdf(urdf)
+    joints = tuple(_joint(entry, i, where) for i, entry in enumerate(tables(data, "joint", where)))
     if not joints:
-        raise DataError("[[joint]]", str(path), "none", "at least one driven joint")
+        raise DataError("[[joint]]", where, "none", "at least one driven joint")
     names = [j.name for j in joints]
-    if len(set(names)) < len(names):
-        raise DataError("[[joint]] name", str(path), "a duplicate", "distinct names")
-    limits = _limits(urdf)
-    for name in [*names, *data.get("locked", {})]:
-        if name not in limits:
-            raise DataError("joint", str(path), name, f"a movable joint of {urdf.name}: {sorted(limits)}")
-    links = _links(urdf)
-    loads = tuple(_load(e, path, links) for e in _tables(data, "load", path))
-    hinges = tuple(_elasticity(e, path, names) for e in _tables(data, "elasticity", path))
+    locked = subtable(data, "locked", where)
+    _distinct([*names, *locked], "[[joint]] and [locked] names", where)
+    for name in [*names, *locked]:
+        if name not in tree.limits:
+            raise DataError("joint", where, name, f"a movable joint of {urdf.name}: {sorted(tree.limits)}")
+    hinges = tuple(_elasticity(e, where, names) for e in tables(data, "elasticity", where))
+    _distinct([h.name for h in hinges], "[[elasticity]] names", where)
     payload_link = data.get("payload_link", "")
-    if payload_link and payload_link not in links:
-        raise DataError("payload_link", str(path), payload_link, f"a link of {urdf.name}")
+    if not isinstance(payload_link, str) or (payload_link and payload_link not in tree.links):
+        raise DataError("payload_link", where, show(payload_link), f"a link of {urdf.name}")
+    gx, gy, gz = vector(data.get("gravity", [0, 0, -9.81]), "gravity", where, 3)
     return Robot(
-        name=str(data.get("name", folder.name)),
+        name=text(data, "name", where, folder.name),
         folder=folder,
         urdf=urdf,
         joints=joints,
         elasticities=hinges,
-        loads=loads,
-        locked={k: float(v) for k, v in data.get("locked", {}).items()},
-        gravity=tuple(_vector(data.get("gravity", [0, 0, -9.81]), "gravity", path)),
+        loads=tuple(_load(e, where, tree.links) for e in tables(data, "load", where)),
+        locked={name: number(locked, name, where) for name in locked},
+        gravity=(float(gx), float(gy), float(gz)),
         mesh_dir=mesh_dir,
         payload_link=payload_link,
-        q_min=np.array([limits[n][0] for n in names]),
-        q_max=np.array([limits[n][1] for n in names]),
+        q_min=np.array([tree.limits[n][0] for n in names]),
+        q_max=np.array([tree.limits[n][1] for n in names]),
         description=str(data.get("description", "")),
     )
+
+
+def moving_links(robot: Robot) -> list[str]:
+    """Links that a driven joint carries directly: one per joint."""
+    child = read_urdf(robot.urdf).child
+    return [child[name] for name in robot.joint_names]
 
 
 def _folder(name_or_path: str | Path, relative_to: Path | None) -> Path:
@@ -155,111 +157,63 @@ def _folder(name_or_path: str | Path, relative_to: Path | None) -> Path:
         if "/" not in text and "\\" not in text:
             candidates.insert(0, ASSETS / text)
     for folder in candidates:
-        if (folder / "robot.toml").is_file():
+        if exists(folder / "robot.toml"):
             return folder.resolve()
     known = sorted(p.parent.name for p in ASSETS.glob("*/robot.toml"))
     raise DataError("robot", text, "no robot.toml", f"one of {known} or the path of a robot folder")
 
 
-def _urdf(entry: Any, folder: Path, path: Path) -> tuple[Path, Path | None]:
-    if not isinstance(entry, dict) or not isinstance(entry.get("file"), str):
-        raise DataError("[urdf]", str(path), repr(entry), 'a table with file = "..."')
+def _urdf(entry: Any, folder: Path, where: str) -> tuple[Path, Path | None]:
+    if not isinstance(entry, dict):
+        raise DataError("[urdf]", where, show(entry), 'a table with file = "..."')
+    file = text(entry, "file", where)
     if "package" in entry:
         share = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share"
-        urdf = share / str(entry["package"]) / entry["file"]
+        urdf = share / text(entry, "package", where) / file
         mesh_dir: Path | None = share
     else:
-        urdf, mesh_dir = folder / entry["file"], folder
-    if not urdf.is_file():
-        raise DataError("[urdf] file", str(path), f"no file {urdf.name}", "an existing URDF")
+        urdf, mesh_dir = folder / file, folder
+    if not exists(urdf):
+        raise DataError("[urdf] file", where, f"no file {urdf.name}", "an existing URDF")
     return urdf, mesh_dir
 
 
-def _tables(data: dict, key: str, path: Path) -> list[dict]:
-    entries = data.get(key, [])
-    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-        raise DataError(f"[[{key}]]", str(path), repr(entries)[:60], "an array of tables")
-    return entries
+def _distinct(names: list[str], what: str, where: str) -> None:
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise DataError(what, where, f"{double[0]} twice", "distinct names")
 
 
-def _number(entry: dict, key: str, path: Path, where: str, *, positive: bool = True) -> float:
-    value = entry.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not np.isfinite(value):
-        raise DataError(f"{where} {key}", str(path), repr(value), "a finite number")
-    if positive and value <= 0:
-        raise DataError(f"{where} {key}", str(path), repr(value), "a number above zero")
-    return float(value)
-
-
-def _vector(value: Any, key: str, path: Path) -> np.ndarray:
-    try:
-        out = np.asarray(value, float)
-    except (TypeError, ValueError):
-        out = np.empty(0)
-    if out.shape != (3,) or not np.all(np.isfinite(out)):
-        raise DataError(key, str(path), repr(value), "three finite numbers")
-    return out
-
-
-def _joint(entry: dict, i: int, path: Path) -> Joint:
-    name = entry.get("name")
-    if not isinstance(name, str):
-        raise DataError(f"[[joint]] {i + 1} name", str(path), repr(name), "a joint's name")
+def _joint(entry: dict, i: int, where: str) -> Joint:
+    name = text(entry, "name", f"{where} joint {i + 1}")
     fields = [f for f in Joint.__dataclass_fields__ if f != "name"]
-    return Joint(name, **{f: _number(entry, f, path, f"joint {name}") for f in fields})
+    return Joint(name, **{f: number(entry, f, f"{where} joint {name}", low=0.0, above=True) for f in fields})
 
 
-def _elasticity(entry: dict, path: Path, joints: list[str]) -> Elasticity:
-    if entry.get("joint") not in [*joints, "base"]:
-        raise DataError("[[elasticity]] joint", str(path), repr(entry.get("joint")), f"base or one of {joints}")
-    name = str(entry.get("name", entry["joint"]))
-    axis = _vector(entry.get("axis"), f"elasticity {name} axis", path)
-    numbers = [_number(entry, key, path, f"elasticity {name}") for key in ("stiffness", "damping")]
-    return Elasticity(name, entry["joint"], tuple(float(a) for a in axis), *numbers)
+def _elasticity(entry: dict, where: str, joints: list[str]) -> Elasticity:
+    joint = entry.get("joint")
+    if joint not in ["base", *joints]:
+        raise DataError("[[elasticity]] joint", where, show(joint), f"base or one of {joints}")
+    name = text(entry, "name", where, joint)
+    where = f"{where} elasticity {name}"
+    x, y, z = vector(entry.get("axis"), "axis", where, 3)
+    if x == y == z == 0:
+        raise DataError("axis", where, "a zero vector", "a direction")
+    stiffness, damping = (number(entry, key, where, low=0.0, above=True) for key in ("stiffness", "damping"))
+    return Elasticity(name, joint, (float(x), float(y), float(z)), stiffness, damping)
 
 
-def _load(entry: dict, path: Path, links: set[str]) -> Load:
-    if entry.get("link") not in links:
-        raise DataError("[[load]] link", str(path), repr(entry.get("link")), f"one of {sorted(links)}")
-    inertia = np.asarray(entry.get("inertia", [0.0, 0.0, 0.0]), float)
-    if inertia.shape == (3,):
-        inertia = np.diag(inertia)
-    if inertia.shape != (3, 3):
-        raise DataError("[[load]] inertia", str(path), repr(entry.get("inertia")), "3 or 3 x 3 numbers")
-    return Load(entry["link"], _number(entry, "mass", path, "load"), _vector(entry.get("com"), "load com", path), inertia)
-
-
-def _root(urdf: Path) -> ET.Element:
-    text = urdf.read_bytes()
-    if b"<!ENTITY" in text:
-        raise DataError("URDF", str(urdf), "an entity declaration", "a URDF without entities")
-    try:
-        return ET.fromstring(text)
-    except ET.ParseError as err:
-        raise DataError("URDF", str(urdf), f"invalid XML ({err})", "a readable URDF") from err
-
-
-def _links(urdf: Path) -> set[str]:
-    return {str(e.get("name")) for e in _root(urdf).findall("link")}
-
-
-def _limits(urdf: Path) -> dict[str, tuple[float, float]]:
-    """Lower and upper position of every movable joint, rad or m."""
-    out = {}
-    for joint in _root(urdf).findall("joint"):
-        if joint.get("type") in ("revolute", "continuous", "prismatic"):
-            limit = joint.find("limit")
-            low = float(limit.get("lower", -np.pi)) if limit is not None else -np.pi
-            high = float(limit.get("upper", np.pi)) if limit is not None else np.pi
-            if joint.get("type") == "continuous":
-                low, high = -np.pi, np.pi
-            out[str(joint.get("name"))] = (low, high)
-    return out
-
-
-def moving_links(robot: Robot) -> list[str]:
-    """Links that a driven joint carries directly: one per joint."""
-    by_joint = {
-        str(j.get("name")): str(j.find("child").get("link")) for j in _root(robot.urdf).findall("joint")
-    }
-    return [by_joint[name] for name in robot.joint_names]
+def _load(entry: dict, where: str, links: frozenset[str]) -> Load:
+    link = entry.get("link")
+    if not isinstance(link, str) or link not in links:
+        raise DataError("[[load]] link", where, show(link), f"one of {sorted(links)}")
+    where = f"{where} load of {link}"
+    rows = entry.get("inertia", [0.0, 0.0, 0.0])
+    if isinstance(rows, list) and len(rows) == 3 and all(isinstance(row, list) for row in rows):
+        inertia = np.array([vector(row, "inertia", where, 3) for row in rows])
+    else:
+        inertia = np.diag(vector(rows, "inertia", where, 3, "3 or 3 x 3 finite numbers"))
+    if not np.allclose(inertia, inertia.T) or np.linalg.eigvalsh(inertia).min() < -1e-9 * np.abs(inertia).max():
+        raise DataError("inertia", where, show(rows), "a symmetric tensor without negative moments")
+    mass = number(entry, "mass", where, low=0.0, above=True)
+    return Load(link, mass, vector(entry.get("com"), "com", where, 3), inertia)

@@ -249,3 +249,20 @@ def test_a_robot_by_relative_path_is_found_from_where_the_dataset_is_saved(folde
     rewrite(folder / "dataset.toml", lambda head: set_odd(head, "robot", "../arm"))
     save_dataset(load_dataset(folder), tmp_path / "deep" / "er" / "copy")
     assert load_dataset(tmp_path / "deep" / "er" / "copy").robot.folder == tmp_path / "arm"
+
+
+@pytest.mark.parametrize("text", ["period = " + "9" * 6000, "x = " + "[" * 5000, "period = 1_", "a.b = 1\na = 2"])
+def test_toml_that_breaks_its_parser_is_one_line(folder, tmp_path, text):
+    (folder / "dataset.toml").write_text(text + "\n" + (folder / "dataset.toml").read_text())
+    assert "dataset.toml" in outcome(load_dataset, folder)
+    (tmp_path / "robot.toml").write_text(text)
+    assert "robot.toml" in outcome(load_robot, tmp_path)
+
+
+def test_notes_beside_a_dataset_are_not_lost(folder):
+    data = load_dataset(folder)
+    (folder / "notes.txt").write_text("cold morning")
+    assert "notes.txt" in outcome(save_dataset, data, folder)
+    assert (folder / "notes.txt").read_text() == "cold morning"
+    (folder / "notes.txt").unlink()
+    assert outcome(save_dataset, data, folder) is None

@@ -27,7 +27,7 @@ def _folder(tmp_path, ur10, old="", new=""):
         ('name = "elbow_joint"', 'name = "knee"', "knee"),
         ("stiffness = 5.0e4", "stiffness = -1.0", "-1.0"),
         ("stiffness = 5.0e4", 'stiffness = "soft"', "soft"),
-        ("motor_inertia = 2.0\n", "", "None"),
+        ("motor_inertia = 2.0\n", "", "no such key"),
         ("ur10_robot.urdf", "none.urdf", "none.urdf"),
         ('link = "wrist_3_link"', 'link = "hand"', "hand"),
         ("[urdf]", "[[[", "invalid TOML"),

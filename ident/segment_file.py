@@ -1,0 +1,129 @@
+"""The columns of one segment's file, Parquet or CSV, read and checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from robot_assets.errors import DataError
+from robot_assets.values import exists
+
+CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")
+REQUIRED = ("tau", "q")
+TIME_TOLERANCE = 0.05  # of a sample period, on every step of `t`
+LARGEST = 1e12  # SI; anything above is no angle, torque or time
+SHORTEST = 16  # samples
+LONGEST = 100_000_000  # samples; more is no recording but a broken or hostile header
+
+
+def read_segment(path: Path, where: str, n: int, rate: float) -> tuple[np.ndarray, dict[str, np.ndarray | None]]:
+    """Read a file.
+
+    Args:
+        where: the entry that names it, for errors. n: number of joints. rate: Hz.
+
+    Returns:
+        t: (N,) s. channels: name of each of ``CHANNELS`` -> (N, n), or None where absent.
+
+    Raises:
+        DataError: with the column, what was found and what was expected.
+    """
+    columns = _columns(path, where)
+    t = _column(columns, "t", path)
+    if len(t) < SHORTEST:
+        raise DataError("column t", str(path), f"{len(t)} samples", f"at least {SHORTEST}")
+    _check_time(t, rate, path)
+    return t, {channel: _channel(columns, channel, n, path) for channel in CHANNELS}
+
+
+def is_ours(name: str) -> bool:
+    """Whether a column belongs to the format; others are left alone."""
+    channel, _, number = name.rpartition("_")
+    return name == "t" or (channel in CHANNELS and number.isascii() and number.isdecimal())
+
+
+def _columns(path: Path, where: str) -> dict[str, np.ndarray]:
+    if not exists(path):
+        raise DataError("file", where, f"no {path.name}", "an existing Parquet or CSV file")
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        raise DataError("file", where, path.name, "a .parquet or .csv file")
+    try:
+        if kind == ".parquet":
+            rows = pq.read_metadata(path).num_rows
+            if rows > LONGEST:
+                raise DataError("samples", str(path), f"{rows}", f"at most {LONGEST}")
+            table = pq.read_table(path, partitioning=None)
+        else:
+            table = pa.csv.read_csv(path)
+        names = table.column_names
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as err:
+        reason = str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__
+        raise DataError("file", str(path), f"unreadable ({reason})", "a complete Parquet or CSV file") from err
+    out = {}
+    for name in filter(is_ours, names):
+        if names.count(name) > 1:
+            raise DataError(f"column {name}", str(path), "it twice", "each column once")
+        column = table.column(name)
+        if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+            raise DataError(f"column {name}", str(path), f"type {column.type}", "numbers")
+        try:
+            out[name] = np.asarray(column.to_numpy(), float)
+        except (pa.ArrowException, ValueError, MemoryError) as err:
+            raise DataError(f"column {name}", str(path), f"unreadable ({err})", "numbers") from err
+    return out
+
+
+def _column(columns: dict[str, np.ndarray], name: str, path: Path) -> np.ndarray:
+    if name not in columns:
+        raise DataError(f"column {name}", str(path), "no such column", "a required column")
+    x = columns[name]
+    bad = np.flatnonzero(~np.isfinite(x))
+    if len(bad):
+        kind = "NaN" if np.isnan(x[bad[0]]) else "infinity"
+        raise DataError(
+            f"column {name}", str(path), f"{kind} at sample {bad[0]} ({len(bad)} not finite in all)", "finite numbers"
+        )
+    if len(x) and np.abs(x).max() > LARGEST:
+        k = int(np.argmax(np.abs(x)))
+        raise DataError(f"column {name}", str(path), f"{x[k]:.3g} at sample {k}", f"at most {LARGEST:g} in SI units")
+    return x
+
+
+def _channel(columns: dict[str, np.ndarray], channel: str, n: int, path: Path) -> np.ndarray | None:
+    """(N, n) of a channel; a partly given link encoder has NaN where a joint has none."""
+    own = {c for c in columns if c.rpartition("_")[0] == channel}
+    wanted = [f"{channel}_{j + 1}" for j in range(n)]
+    surplus = sorted(own - set(wanted))
+    if surplus:
+        raise DataError(f"column {surplus[0]}", str(path), "a column beyond the joints", f"{channel}_1 to {channel}_{n}")
+    if not own and channel not in REQUIRED:
+        return None
+    missing = [c for c in wanted if c not in own]
+    if missing and channel != "q_link":
+        raise DataError(f"column {missing[0]}", str(path), "no such column", f"{channel}_1 to {channel}_{n}")
+    out = np.full((len(columns["t"]), n), np.nan)
+    for j, name in enumerate(wanted):
+        if name in own:
+            out[:, j] = _column(columns, name, path)
+    return out
+
+
+def _check_time(t: np.ndarray, rate: float, path: Path) -> None:
+    step = np.diff(t)
+    bad = np.flatnonzero(np.abs(step * rate - 1.0) > TIME_TOLERANCE)
+    if len(bad) > 0.5 * len(step):
+        middle = float(np.median(step))
+        found = f"a rate of {1 / middle:.6g} Hz" if middle else "a time that stands still"
+        raise DataError("column t", str(path), found, f"sample_rate = {rate:g} Hz")
+    if len(bad):
+        k = int(bad[0])
+        raise DataError(
+            "column t", str(path), f"a step of {step[k]:.6g} s at sample {k} ({len(bad)} such)", f"uniform steps of {1 / rate:.6g} s"
+        )
+    if abs((t[-1] - t[0]) * rate / (len(t) - 1) - 1.0) > 1e-3:
+        raise DataError("column t", str(path), f"a mean rate of {(len(t) - 1) / (t[-1] - t[0]):.6g} Hz", f"sample_rate = {rate:g} Hz")

@@ -1,0 +1,143 @@
+"""What a robot takes from its URDF, checked: links, joints and their limits."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from robot_assets.errors import DataError
+
+MOVABLE = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True)
+class Description:
+    """A tree of links.
+
+    Attributes:
+        links: names. limits: movable joint -> lower and upper position, rad or m.
+        child: joint -> the link it carries.
+    """
+
+    links: frozenset[str]
+    limits: dict[str, tuple[float, float]]
+    child: dict[str, str]
+
+
+def read_urdf(path: Path) -> Description:
+    """Read and check a URDF.
+
+    Raises:
+        DataError: where it is no XML, is no single tree of links, or a figure is no number.
+    """
+    root = _root(path)
+    links = [_name(e, "link", path) for e in root.findall("link")]
+    joints = [(_name(e, "joint", path), e) for e in root.findall("joint")]
+    for names, kind in ((links, "link"), ([name for name, _ in joints], "joint")):
+        double = {n for n in names if names.count(n) > 1}
+        if double:
+            raise DataError(f"{kind} {min(double)}", str(path), "it twice", "distinct names")
+    limits, child, parent = {}, {}, {}
+    for name, joint in joints:
+        ends = []
+        for end in ("parent", "child"):
+            element = joint.find(end)
+            link = None if element is None else element.get("link")
+            if link not in links:
+                raise DataError(f"{end} of joint {name}", str(path), repr(link), "a link of the URDF")
+            ends.append(str(link))
+        if ends[1] in parent:
+            raise DataError(f"link {ends[1]}", str(path), "a second parent", "a tree of links")
+        parent[ends[1]], child[name] = ends[0], ends[1]
+        _numbers(joint.find("origin"), f"joint {name}", path)
+        if joint.get("type") in MOVABLE:
+            limits[name] = _limit(joint, name, path)
+            axis = _vector(joint.find("axis"), "xyz", f"axis of joint {name}", path, "1 0 0")
+            if not np.any(axis):
+                raise DataError(f"axis of joint {name}", str(path), "a zero vector", "a direction")
+        elif joint.get("type") != "fixed":
+            raise DataError(f"joint {name} type", str(path), repr(joint.get("type")), f"fixed or one of {MOVABLE}")
+    _one_tree(links, parent, path)
+    for element, link in zip(root.findall("link"), links, strict=True):
+        _check_inertial(element.find("inertial"), link, path)
+    return Description(frozenset(links), limits, child)
+
+
+def _root(path: Path) -> ET.Element:
+    text = path.read_bytes()
+    if b"<!ENTITY" in text:
+        raise DataError("URDF", str(path), "an entity declaration", "a URDF without entities")
+    try:
+        return ET.fromstring(text)
+    except (ET.ParseError, ValueError, LookupError) as err:
+        raise DataError("URDF", str(path), f"invalid XML ({err})", "a readable URDF") from err
+
+
+def _name(element: ET.Element, kind: str, path: Path) -> str:
+    name = element.get("name")
+    if not name:
+        raise DataError(f"{kind} name", str(path), repr(name), "a name")
+    return name
+
+
+def _one_tree(links: list[str], parent: dict[str, str], path: Path) -> None:
+    roots = [link for link in links if link not in parent]
+    if len(roots) != 1:
+        raise DataError("links", str(path), f"{len(roots)} without a parent {roots[:4]}", "a tree with one root")
+    for link in links:
+        at, steps = link, 0
+        while at in parent and steps <= len(links):
+            at, steps = parent[at], steps + 1
+        if at != roots[0]:
+            raise DataError(f"link {link}", str(path), "a loop of joints", "a tree of links")
+
+
+def _limit(joint: ET.Element, name: str, path: Path) -> tuple[float, float]:
+    limit = joint.find("limit")
+    if limit is None or joint.get("type") == "continuous":
+        return -np.pi, np.pi
+    low = _number(limit.get("lower", str(-np.pi)), f"lower limit of joint {name}", path)
+    high = _number(limit.get("upper", str(np.pi)), f"upper limit of joint {name}", path)
+    if low >= high:
+        raise DataError(f"limit of joint {name}", str(path), f"{low:g} to {high:g}", "a lower limit below the upper")
+    return low, high
+
+
+def _check_inertial(inertial: ET.Element | None, link: str, path: Path) -> None:
+    if inertial is None:
+        return
+    _numbers(inertial.find("origin"), f"inertial of link {link}", path)
+    mass, tensor = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or tensor is None:
+        raise DataError(f"inertial of link {link}", str(path), "no mass or no inertia", "both")
+    if _number(mass.get("value"), f"mass of link {link}", path) < 0:
+        raise DataError(f"mass of link {link}", str(path), str(mass.get("value")), "at least zero")
+    for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"):
+        value = _number(tensor.get(key, "0"), f"{key} of link {link}", path)
+        if key in ("ixx", "iyy", "izz") and value < 0:
+            raise DataError(f"{key} of link {link}", str(path), f"{value:g}", "at least zero")
+
+
+def _numbers(origin: ET.Element | None, what: str, path: Path) -> None:
+    for key in ("xyz", "rpy"):
+        _vector(origin, key, f"{key} of {what}", path, "0 0 0")
+
+
+def _vector(element: ET.Element | None, key: str, what: str, path: Path, default: str) -> list[float]:
+    words = (default if element is None else element.get(key, default)).split()
+    if len(words) != 3:
+        raise DataError(what, str(path), " ".join(words), "three numbers")
+    return [_number(word, what, path) for word in words]
+
+
+def _number(word: str | None, what: str, path: Path) -> float:
+    try:
+        value = float(str(word))
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise DataError(what, str(path), repr(word), "a finite number")
+    return value
