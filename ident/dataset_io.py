@@ -55,7 +55,7 @@ def load_dataset(path: str | Path) -> Dataset:
         raise DataError("[[segment]]", where, f"{len(entries)} entries", f"1 to {MAX_SEGMENTS}")
     seen: dict[str, str] = {}
     return Dataset(
-        name=text(head, "name", where, folder.resolve().name or "dataset"),
+        name=str(head.get("name") or folder.resolve().name),
         robot_ref=head["robot"],
         robot=robot,
         sample_rate=rate,

@@ -7,20 +7,28 @@ over the n_u experiments of a realization (Dobrowiecki, Schoukens and Guillaume 
 
 from __future__ import annotations
 
-import tomllib
+import os
+import tempfile
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import tomlkit
+from scipy.interpolate import CubicSpline
 
 from robot_assets.errors import DataError
-from robot_assets.robot import Robot, load_robot
+from robot_assets.robot import ASSETS, Robot, load_robot
+from robot_assets.values import choice, number, read_toml, tables, text, vector, whole
 
 DRAWS = 100  # random phases tried for the lowest crest factor
 MOTION = 0.010  # rad rms, motor motion aimed at for level 1
 TORQUE_SHARE = 0.6  # of the torque limit that gravity and excitation may take together
 SPEED_SHARE = 0.5  # of the velocity limit
+PLAN_FORMAT = "simgap-plan/1"
+INJECTIONS = ("torque", "position")
+ROLES = ("identification", "validation")
+STRIDE = 10  # of the samples of a motion in a plan's file; the rest by cubic splines
 
 
 @dataclass(frozen=True)
@@ -80,11 +88,25 @@ class Plan:
 
 
 def odd_random_grid(
-    rng: np.random.Generator, period: int, sample_rate: float, band_hz: tuple[float, float], group: int = 4
+    rng: np.random.Generator,
+    period: int,
+    sample_rate: float,
+    band_hz: tuple[float, float],
+    group: int = 4,
+    per_decade: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Odd lines of a band, one of every ``group`` left out at random: (excited, detection)."""
-    low, high = (int(np.ceil(f * period / sample_rate)) for f in band_hz)
+    """Odd lines of a band, one of every ``group`` left out at random: (excited, detection).
+
+    Args:
+        per_decade: about so many lines a decade, log-spaced and rounded to odd lines; all odd
+            lines where None.
+    """
+    low, high = (f * period / sample_rate for f in band_hz)
+    low, high = int(np.ceil(low - 1e-9)), int(np.floor(high + 1e-9))
     odd = np.arange(low | 1, high + 1, 2)
+    if per_decade is not None and len(odd):
+        wanted = np.geomspace(odd[0], odd[-1], max(2, round(per_decade * np.log10(odd[-1] / odd[0])) + 1))
+        odd = np.unique(2 * (wanted.astype(int) // 2) + 1)
     n_groups = len(odd) // group
     left_out = np.arange(n_groups) * group + rng.integers(group, size=n_groups)
     return np.delete(odd, left_out), odd[left_out]
@@ -103,7 +125,7 @@ def orthogonal_multisines(
     n = amplitudes.shape[1]
     k = np.arange(n)
     T = np.exp(2j * np.pi * np.outer(k, k) / n) / np.sqrt(n)
-    best, best_crest = None, np.inf
+    best, best_crest = np.empty((n, period, n)), np.inf
     for _ in range(max(1, draws // n)):
         phase_in = np.exp(2j * np.pi * rng.random((len(lines), n, 1)))
         phase_exp = np.exp(2j * np.pi * rng.random((len(lines), 1, n)))
@@ -174,12 +196,14 @@ def make_plan(
     validation_points: int = 1,
     realizations: int = 1,
     levels: tuple[float, ...] = (1.0, 0.5, 0.25),
+    levels_per_point: int | None = None,
     seed: int = 0,
     sample_rate: float = 1000.0,
     period: int = 4000,
     periods: int = 3,
     transient_periods: int = 1,
     band_hz: tuple[float, float] = (0.4, 70.0),
+    per_decade: int | None = None,
     injection: str = "torque",
     postures: np.ndarray | None = None,
     inertia: np.ndarray | None = None,
@@ -188,24 +212,33 @@ def make_plan(
 ) -> Plan:
     """Multisines at operating points, and held-out segments.
 
-    Every identification point is measured at one level of ``levels`` in turn when there are at
-    least as many points as levels; with fewer points every point is measured at every level.
+    Every identification point is measured with n experiments per realization and level, a
+    held-out one at the first level alone: two points at three levels are 36 segments of a
+    six-axis arm.
 
     Args:
+        levels: relative excitation levels, the largest first.
+        levels_per_point: levels measured at each point, taking turns from point to point, to
+            spread a budget over more points; all of them where None.
+        band_hz, per_decade: see ``odd_random_grid``.
         inertia: (n,) kg m2 that each motor moves; three times its own where None.
         gravity_torque: (n,) largest static torque in the postures, N m.
 
     Raises:
         DataError: where a number cannot be used.
     """
-    if injection not in ("torque", "position"):
-        raise DataError("injection", "plan", repr(injection), '"torque" or "position"')
+    if injection not in INJECTIONS:
+        raise DataError("injection", "plan", repr(injection), f"one of {INJECTIONS}")
     if points < 1 or realizations < 1 or periods <= transient_periods or period < 64:
         raise DataError("plan", "points, realizations, periods, period", "a number too small", "at least one of each, and a steady period")
     if not 0 < band_hz[0] < band_hz[1] < 0.5 * sample_rate:
         raise DataError("band_hz", "plan", str(band_hz), f"rising, below Nyquist {0.5 * sample_rate:g} Hz")
+    if not levels or not all(0 < level <= 1e3 for level in levels):
+        raise DataError("levels", "plan", str(levels), "at least one number above zero")
     rng = np.random.default_rng(seed)
-    lines, detection = odd_random_grid(rng, period, sample_rate, band_hz)
+    lines, detection = odd_random_grid(rng, period, sample_rate, band_hz, per_decade=per_decade)
+    if not len(lines):
+        raise DataError("band_hz", "plan", str(band_hz), f"a band that holds odd multiples of {sample_rate / period:g} Hz")
     excitation = Excitation(sample_rate, period, periods, transient_periods, lines, detection)
     if postures is None:
         postures = operating_points(robot, points + validation_points, rng)
@@ -219,7 +252,7 @@ def make_plan(
         role = "validation" if held_out else "identification"
         for m in range(realizations):
             r = orthogonal_multisines(rng, lines, amplitudes, period)
-            for level in levels if not held_out else (levels[0],):
+            for level in _levels_at(i, levels, levels_per_point) if not held_out else (levels[0],):
                 for e in range(robot.n):
                     experiments.append(
                         Experiment(f"op{i + 1:02d}", np.asarray(q0, float), e + 1, m + 1, level, role, level * r[e])
@@ -228,15 +261,25 @@ def make_plan(
     return Plan(robot, excitation, tuple(experiments), moves, injection, seed)
 
 
+def _levels_at(point: int, levels: tuple[float, ...], count: int | None) -> tuple[float, ...]:
+    """The levels of one operating point, largest first; every level is first in its turn."""
+    if count is None or count >= len(levels):
+        return levels
+    chosen = {(point + k) % len(levels) for k in range(max(1, count))}
+    return tuple(levels[k] for k in sorted(chosen))
+
+
 def _validation_motion(robot: Robot, postures: np.ndarray, rng: np.random.Generator, rate: float) -> Trajectory:
     """A motion through three postures near the first, by fifth-order polynomials with rests."""
     first = postures[0]
+    margin = 0.05 * (robot.q_max - robot.q_min)
     stops = [first]
     for _ in range(3):
-        stops.append(first + rng.uniform(-0.35, 0.35, robot.n))
+        stop = first + rng.uniform(-0.35, 0.35, robot.n)
+        stops.append(np.clip(stop, np.minimum(first, robot.q_min + margin), np.maximum(first, robot.q_max - margin)))
     stops.append(first)
     pieces = [np.repeat(first[None], int(0.5 * rate), axis=0)]
-    for a, b in zip(stops[:-1], stops[1:], strict=True):
+    for a, b in pairwise(stops):
         duration = max(1.2, float(np.max(1.9 * np.abs(b - a) / (SPEED_SHARE * robot.array("velocity_limit")))))
         u = np.linspace(0, 1, int(duration * rate), endpoint=False)[:, None]
         pieces.append(a + (b - a) * (10 * u**3 - 15 * u**4 + 6 * u**5))
@@ -245,38 +288,39 @@ def _validation_motion(robot: Robot, postures: np.ndarray, rng: np.random.Genera
 
 
 def plan_to_toml(plan: Plan, path: str | Path) -> None:
-    """Write a plan; the excitation signals are drawn anew from its phases when it is read."""
-    x = plan.excitation
-    spectra = []
+    """Write a plan: spectra of the excitation on its lines, motions by every ``STRIDE``-th sample."""
+    x, target = plan.excitation, Path(path).absolute()
+    experiments = []
     for e in plan.experiments:
         R = np.fft.rfft(e.r, axis=0, norm="forward")[x.lines]
-        spectra.append(
-            {
-                "operating_point": e.operating_point,
-                "q0": e.q0.tolist(),
-                "experiment": e.experiment,
-                "realization": e.realization,
-                "amplitude": e.amplitude,
-                "role": e.role,
-                "real": R.real.round(12).tolist(),
-                "imag": R.imag.round(12).tolist(),
-            }
-        )
+        entry = {"operating_point": e.operating_point, "role": e.role, "q0": e.q0.tolist()}
+        entry |= {"experiment": e.experiment, "realization": e.realization, "amplitude": float(e.amplitude)}
+        experiments.append(entry | {"real": R.real.round(12).tolist(), "imag": R.imag.round(12).tolist()})
+    motions = []
+    for m in plan.trajectories:
+        points = m.q_ref[_knots(len(m.q_ref))].round(12).tolist()
+        motions.append({"name": m.name, "role": m.role, "samples": len(m.q_ref), "q_ref": points})
+    known = plan.robot.folder.parent == ASSETS.resolve()
     head = {
-        "format": "simgap-plan/1",
-        "robot": plan.robot.name if (Path(__file__).parent.parent / "robot_assets" / plan.robot.name).is_dir() else str(plan.robot.folder),
+        "format": PLAN_FORMAT,
+        "robot": plan.robot.folder.name if known else str(plan.robot.folder),
         "injection": plan.injection,
         "seed": plan.seed,
-        "sample_rate": x.sample_rate,
+        "sample_rate": float(x.sample_rate),
         "period": x.period,
         "periods": x.periods,
         "transient_periods": x.transient_periods,
         "lines": x.lines.tolist(),
         "detection": x.detection.tolist(),
-        "trajectory": [{"name": t.name, "role": t.role, "q_ref": t.q_ref[::10].round(9).tolist(), "stride": 10, "samples": len(t.q_ref)} for t in plan.trajectories],
-        "experiment": spectra,
+        "trajectory": motions,
+        "experiment": experiments,
     }
-    Path(path).write_text(tomlkit.dumps(head), encoding="utf-8")
+    content = tomlkit.dumps(head)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=target.parent, prefix=f".{target.name}-", delete=False, encoding="utf-8") as file:
+        file.write(content)
+    os.chmod(file.name, 0o644)
+    os.replace(file.name, target)
 
 
 def plan_from_toml(path: str | Path) -> Plan:
@@ -285,32 +329,68 @@ def plan_from_toml(path: str | Path) -> Plan:
     Raises:
         DataError: where the file is missing or is no plan.
     """
-    try:
-        head = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
-        raise DataError("plan", str(path), str(err), "a readable plan") from err
-    if head.get("format") != "simgap-plan/1":
-        raise DataError("format", str(path), repr(head.get("format")), "'simgap-plan/1'")
-    try:
-        lines = np.asarray(head["lines"], int)
-        x = Excitation(
-            float(head["sample_rate"]), int(head["period"]), int(head["periods"]),
-            int(head["transient_periods"]), lines, np.asarray(head["detection"], int),
-        )
-        experiments = []
-        for e in head["experiment"]:
-            X = np.zeros((x.period // 2 + 1, len(e["q0"])), complex)
-            X[lines] = np.asarray(e["real"]) + 1j * np.asarray(e["imag"])
-            r = np.fft.irfft(X, n=x.period, axis=0, norm="forward")
-            experiments.append(
-                Experiment(e["operating_point"], np.asarray(e["q0"], float), e["experiment"], e["realization"], e["amplitude"], e["role"], r)
-            )
-        moves = []
-        for t in head.get("trajectory", []):
-            coarse = np.asarray(t["q_ref"], float)
-            at = np.arange(len(coarse)) * t["stride"]
-            fine = np.stack([np.interp(np.arange(t["samples"]), at, c) for c in coarse.T], axis=1)
-            moves.append(Trajectory(t["name"], fine, t["role"]))
-    except (KeyError, TypeError, ValueError, IndexError) as err:
-        raise DataError("plan", str(path), f"{type(err).__name__} {err}", "a complete plan") from err
-    return Plan(load_robot(head["robot"], Path(path).parent), x, tuple(experiments), tuple(moves), head["injection"], int(head["seed"]))
+    where = str(path)
+    head = read_toml(Path(path), "plan")
+    choice(head, "format", where, (PLAN_FORMAT,))
+    robot = load_robot(text(head, "robot", where), Path(path).parent)
+    period = whole(head, "period", where, low=4, high=10**7)
+    periods = whole(head, "periods", where, low=1, high=10**4)
+    x = Excitation(
+        number(head, "sample_rate", where, low=1e-3, high=1e7),
+        period,
+        periods,
+        whole(head, "transient_periods", where, low=0, high=periods - 1),
+        _lines(head, "lines", period, where),
+        _lines(head, "detection", period, where),
+    )
+    return Plan(
+        robot=robot,
+        excitation=x,
+        experiments=tuple(_experiment(e, x, robot, where) for e in tables(head, "experiment", where)),
+        trajectories=tuple(_trajectory(m, robot, where) for m in tables(head, "trajectory", where)),
+        injection=choice(head, "injection", where, INJECTIONS),
+        seed=whole(head, "seed", where, low=0),
+    )
+
+
+def _knots(samples: int) -> np.ndarray:
+    """Samples of a motion that are written: every ``STRIDE``-th and the last."""
+    return np.unique(np.append(np.arange(0, samples, STRIDE), samples - 1))
+
+
+def _lines(head: dict, key: str, period: int, where: str) -> np.ndarray:
+    lines = head.get(key)
+    if not isinstance(lines, list) or not all(isinstance(k, int) and 0 < k < period / 2 for k in lines):
+        raise DataError(key, where, repr(lines), f"a list of lines from 1 to below Nyquist, {period / 2:g}")
+    return np.asarray(lines, int)
+
+
+def _experiment(entry: dict, x: Excitation, robot: Robot, where: str) -> Experiment:
+    X = np.zeros((x.period // 2 + 1, robot.n), complex)
+    for key, unit in (("real", 1.0), ("imag", 1j)):
+        X[x.lines] += unit * _rows(entry, key, len(x.lines), robot.n, where)
+    return Experiment(
+        operating_point=text(entry, "operating_point", where),
+        q0=vector(entry.get("q0"), "q0", where, robot.n),
+        experiment=whole(entry, "experiment", where, low=1),
+        realization=whole(entry, "realization", where, low=1),
+        amplitude=number(entry, "amplitude", where, low=1e-9, high=1e9),
+        role=choice(entry, "role", where, ROLES),
+        r=np.fft.irfft(X, n=x.period, axis=0, norm="forward"),
+    )
+
+
+def _trajectory(entry: dict, robot: Robot, where: str) -> Trajectory:
+    samples = whole(entry, "samples", where, low=2 * STRIDE, high=10**7)
+    at = _knots(samples)
+    points = _rows(entry, "q_ref", len(at), robot.n, where)
+    motion = CubicSpline(at, points)(np.arange(samples))
+    return Trajectory(text(entry, "name", where), motion, choice(entry, "role", where, ROLES))
+
+
+def _rows(entry: dict, key: str, count: int, n: int, where: str) -> np.ndarray:
+    rows = entry.get(key)
+    if not isinstance(rows, list) or len(rows) != count:
+        found = f"{len(rows)} rows" if isinstance(rows, list) else "no such key"
+        raise DataError(key, where, found, f"{count} rows of {n} numbers")
+    return np.array([vector(row, key, where, n) for row in rows]).reshape(count, n)
