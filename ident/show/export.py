@@ -12,6 +12,7 @@ import pinocchio as pin
 import tomlkit
 
 from ident.graybox import build_structure, parameter_unit
+from ident.show.figures import unit_suffix
 from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
 
@@ -31,7 +32,12 @@ def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
     }
     for name, value in diagnosis.verdict.baseline.items():
         kind, joint = name.split(".", 1)
-        entry = {"value": value.value, "std": value.std, "unit": parameter_unit(name)}
+        entry = {
+            "value": value.value,
+            "std": value.std,
+            "unit": parameter_unit(name),
+            "identified": name not in diagnosis.verdict.unidentified,
+        }
         head["parameters"].setdefault(joint, {})[kind] = entry
     for cause in diagnosis.verdict.causes:
         head["effect"].append(
@@ -57,7 +63,8 @@ def build_mjcf(robot: Robot, parameters: dict[str, float], causes: Sequence[Caus
 
     Bodies are written from the Pinocchio chain. A motor is a rotor beside the chain; a fixed
     tendon of length ``q_motor - q_link`` is its gear. Effects are native elements where MuJoCo has
-    them, and all are kept as ``<custom>`` numbers ``simgap.<i>.<effect>.<place>.<parameter>``.
+    them. All are kept as ``<custom>`` numbers ``simgap.<i>.<effect>.<place>.<parameter>`` and a text
+    ``simgap.effect.<i>`` that says which element stands for the effect, if one does.
 
     Args:
         parameters: by the names of ``ident.graybox.parameter_names``.
@@ -70,13 +77,17 @@ def build_mjcf(robot: Robot, parameters: dict[str, float], causes: Sequence[Caus
         )
         for h in robot.elasticities
     )
-    hidden = tuple(_hidden_hinge(c) for c in causes if c.effect.endswith("_elasticity"))
+    hidden = tuple(_hidden_hinge(i, c) for i, c in enumerate(causes) if c.effect.endswith("_elasticity"))
     loads = tuple(_payload(robot, c) for c in causes if c.effect == "payload")
-    scales = {c.joint: c.parameters["scale"].value for c in causes if c.effect == "link_inertia"}
+    scales: dict[str, float] = {}
+    for c in causes:
+        if c.effect == "link_inertia":
+            scales[c.joint] = scales.get(c.joint, 1.0) * c.parameters["scale"].value
     arm = replace(robot, elasticities=hinges)
     structure = build_structure(arm, elasticities=hidden, loads=loads, scale_links=scales)
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
+    spec.compiler.degree = False  # else angles such as springref are taken as degrees
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     spec.option.gravity = list(robot.gravity)
@@ -85,14 +96,21 @@ def build_mjcf(robot: Robot, parameters: dict[str, float], causes: Sequence[Caus
     for joint in robot.joints:
         _add_motor(spec, joint.name, parameters)
     for i, cause in enumerate(causes):
-        _add_effect(spec, robot, i, cause, parameters)
+        _note_effect(spec, i, cause)
+        if cause.joint in robot.joint_names:
+            _add_effect(spec, robot, cause)
+    for (source, target), ratio in _couplings(robot, causes).items():
+        for kind in ("gear", "outer"):
+            tendon = spec.tendon(f"{kind}:{target}")
+            if tendon is not None:
+                tendon.wrap_joint(f"motor:{source}", ratio)
     return spec
 
 
-def _hidden_hinge(cause: Cause) -> Elasticity:
+def _hidden_hinge(index: int, cause: Cause) -> Elasticity:
     p = {k: v.value for k, v in cause.parameters.items()}
     axis = (p["axis_x"], p["axis_y"], p["axis_z"])
-    return Elasticity(f"{cause.effect}:{cause.joint}", cause.joint, axis, p["stiffness"], p["damping"])
+    return Elasticity(f"{cause.effect}:{cause.joint}:{index}", cause.joint, axis, p["stiffness"], p["damping"])
 
 
 def _payload(robot: Robot, cause: Cause) -> tuple[str, pin.Inertia]:
@@ -126,6 +144,22 @@ def _add_bodies(spec: mujoco.MjSpec, model: pin.Model, springs: dict[str, Elasti
             joint.stiffness = [springs[name].stiffness, 0, 0]
             joint.damping = [springs[name].damping, 0, 0]
         bodies[i] = body
+        if np.linalg.norm(placement.translation) > 0.02 and model.parents[i]:
+            _add_bone(bodies[model.parents[i]], placement.translation)
+
+
+def _add_bone(body: mujoco.MjsBody, end: np.ndarray) -> None:
+    """A capsule from a joint to the next, for the eye alone: no mass, no contact."""
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[0, 0, 0, *end],
+        size=[0.03, 0, 0],
+        mass=0,
+        contype=0,
+        conaffinity=0,
+        group=2,
+        rgba=[0.67, 0.7, 0.73, 1],
+    )
 
 
 def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> None:
@@ -148,45 +182,90 @@ def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> 
     drive.set_to_motor()
 
 
-def _add_effect(spec: mujoco.MjSpec, robot: Robot, index: int, cause: Cause, parameters: dict[str, float]) -> None:
-    p = {k: v.value for k, v in cause.parameters.items()}
-    for key, value in p.items():
+NATIVE = {
+    "coulomb_friction": "frictionloss of motor:{place}, symmetric",
+    "stribeck_friction": "frictionloss of motor:{place} at the Coulomb level, without the dip",
+    "presliding_friction": "frictionloss of motor:{place} at the Coulomb level, without the bristle",
+    "torque_constant": "gear of drive:{place}",
+    "torque_lag": "exact first-order filter of drive:{place}",
+    "torque_delay": "delay of drive:{place}",
+    "torque_saturation": "forcerange of drive:{place}",
+    "hardening_stiffness": "cubic stiffness of gear:{place}",
+    "softening_stiffness": "gear:{place} and, with a dead band, outer:{place}",
+    "backlash": "springlength of gear:{place}",
+    "gravity_spring": "spring of link:{place}",
+    "dress_pack": "spring and frictionloss of link:{place}",
+    "joint_coupling": "motor:{place} in the gear of the next joint",
+    "payload": "inertia of the last body",
+    "link_inertia": "inertia of the body",
+    "transverse_elasticity": "hinge elasticity:{effect}:{place}:{index}",
+    "base_elasticity": "hinge elasticity:{effect}:{place}:{index}",
+}
+
+
+def _note_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
+    """The effect as custom elements, whether or not MuJoCo has an element for it."""
+    for key, x in cause.parameters.items():
         number = spec.add_numeric(name=f"simgap.{index}.{cause.effect}.{cause.joint}.{key}")
-        number.data, number.size = [float(value)], 1
+        number.data, number.size = [float(x.value)], 1
+    values = ", ".join(f"{k} = {x.value:.6g} +- {x.std:.2g}{unit_suffix(x.unit)}" for k, x in cause.parameters.items())
+    element = NATIVE.get(cause.effect, "none: not simulated by this file")
+    element = element.format(place=cause.joint, effect=cause.effect, index=index)
+    text = spec.add_text(name=f"simgap.effect.{index}")
+    text.data = f"{cause.effect} at {cause.joint}, probability {cause.probability:.3f}; {values}; element: {element}"
+
+
+def _couplings(robot: Robot, causes: Sequence[Cause]) -> dict[tuple[str, str], float]:
+    """(motor, next joint) -> ratio; a tendon takes a joint once."""
+    out: dict[tuple[str, str], float] = {}
+    for c in causes:
+        if c.effect == "joint_coupling":
+            pair = (c.joint, robot.joint_names[robot.joint_names.index(c.joint) + 1])
+            out[pair] = out.get(pair, 0.0) + c.parameters["ratio"].value
+    return out
+
+
+def _add_effect(spec: mujoco.MjSpec, robot: Robot, cause: Cause) -> None:
+    """Native elements of an effect at a joint, on top of those of effects before it."""
+    p = {k: v.value for k, v in cause.parameters.items()}
     name = cause.joint
-    if name not in robot.joint_names:
-        return
     motor, link = spec.joint(f"motor:{name}"), spec.joint(f"link:{name}")
     gear, drive = spec.tendon(f"gear:{name}"), spec.actuator(f"drive:{name}")
-    k = parameters[f"stiffness.{name}"]
     if cause.effect == "coulomb_friction":
-        motor.frictionloss = p["torque"]
+        motor.frictionloss += p["torque"]
     elif cause.effect in ("stribeck_friction", "presliding_friction"):
-        motor.frictionloss = p["coulomb"]
+        motor.frictionloss += p["coulomb"]
     elif cause.effect == "torque_constant":
-        drive.gear = [p["scale"], 0, 0, 0, 0, 0]
+        drive.gear = [drive.gear[0] * p["scale"], 0, 0, 0, 0, 0]
     elif cause.effect == "torque_delay":
-        drive.delay, drive.nsample = p["delay"], int(np.ceil(p["delay"] / TIMESTEP)) + 2
+        drive.delay += p["delay"]
+        drive.nsample = int(np.ceil(drive.delay / TIMESTEP)) + 2
     elif cause.effect == "torque_lag":
         drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
         drive.dynprm = [p["time_constant"], *([0] * (len(drive.dynprm) - 1))]
     elif cause.effect == "torque_saturation":
         drive.forcelimited, drive.forcerange = True, [-p["limit"], p["limit"]]
     elif cause.effect == "hardening_stiffness":
-        gear.stiffness = [k, 0, p["cubic"]]
+        gear.stiffness = [gear.stiffness[0], 0, gear.stiffness[2] + p["cubic"]]
     elif cause.effect == "backlash":
         gear.springlength = [-0.5 * p["gap"], 0.5 * p["gap"]]
     elif cause.effect == "softening_stiffness":
+        k = float(gear.stiffness[0])
         low = min(p["low_stiffness"], k)
-        gear.stiffness = [low, 0, 0]
+        gear.stiffness = [low, 0, gear.stiffness[2]]
         outer = spec.add_tendon(name=f"outer:{name}")
         outer.wrap_joint(f"motor:{name}", 1.0)
         outer.wrap_joint(f"link:{name}", -1.0)
         outer.stiffness, outer.springlength = [k - low, 0, 0], [-p["transition"], p["transition"]]
-    elif cause.effect == "gravity_spring":
-        link.stiffness, link.springref = [p["stiffness"], 0, 0], p["rest_angle"]
-    elif cause.effect == "dress_pack":
-        link.stiffness, link.frictionloss = [p["stiffness"], 0, 0], p["friction"]
-    elif cause.effect == "joint_coupling":
-        target = robot.joint_names[robot.joint_names.index(name) + 1]
-        spec.tendon(f"gear:{target}").wrap_joint(f"motor:{name}", p["ratio"])
+    elif cause.effect in ("gravity_spring", "dress_pack"):
+        _add_spring(link, p["stiffness"], p.get("rest_angle", 0.0))
+        link.frictionloss += p.get("friction", 0.0)
+
+
+def _add_spring(joint: mujoco.MjsJoint, stiffness: float, rest: float) -> None:
+    """A spring in parallel with the one that the joint has."""
+    own = float(joint.stiffness[0])
+    total = own + stiffness
+    if total > 0:
+        joint.springref = (own * joint.springref + stiffness * rest) / total
+        joint.stiffness = [total, 0, 0]

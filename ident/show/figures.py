@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 
 import matplotlib
 
@@ -14,80 +15,188 @@ from matplotlib.colors import LogNorm
 
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace
 
-MEASURED, BEFORE, AFTER = "#333333", "#c8553d", "#2a7f9e"
+# Stand-ins that the page replaces by its own colours, light or dark.
+INK, SOFT, GRID, MEASURED, BEFORE, AFTER = "#0a0b0c", "#0a0b0d", "#0a0b0e", "#0a0b0f", "#0a0b10", "#0a0b11"
+CSS = {
+    INK: "var(--ink)",
+    SOFT: "var(--soft)",
+    GRID: "var(--line)",
+    MEASURED: "var(--measured)",
+    BEFORE: "var(--before)",
+    AFTER: "var(--after)",
+}
+DARK = {INK: "#e6e8ea", SOFT: "#9aa4ad", GRID: "#34393e", MEASURED: "#b9c1c8", BEFORE: "#e0694e", AFTER: "#3f9fc4"}
 STYLE = {
     "font.size": 8,
+    "text.color": INK,
+    "axes.labelcolor": SOFT,
+    "axes.edgecolor": SOFT,
+    "axes.titlecolor": INK,
+    "axes.linewidth": 0.6,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "xtick.labelcolor": SOFT,
+    "ytick.labelcolor": SOFT,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.alpha": 0.25,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "axes.facecolor": "none",
     "svg.fonttype": "path",
-    "figure.facecolor": "white",
 }
 POINTS = 1500
+CURVE = 300
+
+
+def unit_suffix(unit: str) -> str:
+    """The unit behind a number; nothing behind a pure one."""
+    return "" if unit in ("", "1") else f" {unit}"
+
+
+def rounded(value: float, std: float) -> str:
+    """A number and its standard deviation, both to two digits of the latter."""
+    if not (np.isfinite(std) and std > 0 and np.isfinite(value)):
+        return f"{value:.5g}" if std == 0 else f"{value:.5g} ± {std:.2g}"
+    size = max(abs(value), std)
+    if not 1e-3 <= size < 1e6:
+        power = int(np.floor(np.log10(size)))
+        decimals = max(0, power - int(np.floor(np.log10(std))) + 1)
+        return f"({value / 10.0**power:.{decimals}f} ± {std / 10.0**power:.{decimals}f})·10^{power}"
+    decimals = max(0, 1 - int(np.floor(np.log10(std))))
+    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
 def _svg(fig) -> str:
     buffer = io.StringIO()
-    fig.savefig(buffer, format="svg", bbox_inches="tight")
+    fig.savefig(buffer, format="svg", bbox_inches="tight", transparent=True, metadata={"Date": None})
     plt.close(fig)
     text = buffer.getvalue()
+    for colour, variable in CSS.items():
+        text = text.replace(colour, variable)
     return text[text.index("<svg") :]
 
 
+def _draw_response(
+    ax, view: FrfView, row: int, column: int, size: float = 2.0, colours: dict[str, str] | None = None
+) -> None:
+    """One entry of the FRF: measured with its standard deviation, and both models."""
+    ink = {c: (colours or {}).get(c, c) for c in CSS}
+    step = max(1, len(view.frequency) // CURVE)
+    f = view.frequency[::step]
+    entry = (slice(None, None, step), row, column)
+    gain, std = np.abs(view.measured[entry]), view.measured_std[entry]
+    ax.loglog(f, gain, ".", ms=size, mew=0, color=ink[MEASURED], label="measured")
+    ax.loglog(f, np.abs(view.baseline[entry]), color=ink[BEFORE], lw=0.9, label="baseline")
+    ax.loglog(f, np.abs(view.extended[entry]), color=ink[AFTER], lw=0.9, label="extended, linear part")
+    ax.loglog(f, np.maximum(std, 1e-12), color=ink[SOFT], lw=0.8, ls=":", label="σ of the measurement")
+    seen = gain[np.isfinite(gain) & (gain > 0)]
+    if len(seen):
+        ax.set_ylim(np.min(seen) * 0.03, np.max(seen) * 3)
+    ax.minorticks_off()
+
+
+def _legend(fig, ax) -> None:
+    handles, labels = ax.get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8, markerscale=3)
+
+
 def frf_figure(view: FrfView, joints: tuple[str, ...]) -> str:
-    """Gain of the diagonal entries of one operating point, and the errors of both models."""
+    """Gain of the diagonal entries of one operating point."""
     n = len(joints)
     columns = min(n, 3)
     rows = -(-n // columns)
     with plt.rc_context(STYLE):
-        fig, axes = plt.subplots(rows, columns, figsize=(3.3 * columns, 2.3 * rows), squeeze=False, layout="constrained")
+        fig, axes = plt.subplots(
+            rows, columns, figsize=(3.5 * columns, 2.3 * rows + 0.3), sharex=True, squeeze=False, layout="constrained"
+        )
         for ax in axes.flat[n:]:
             ax.set_visible(False)
         for j, ax in zip(range(n), axes.flat, strict=False):
-            f = view.frequency
-            ax.loglog(f, np.abs(view.measured[:, j, j]), ".", ms=2.5, color=MEASURED, label="measured")
-            ax.loglog(f, np.abs(view.baseline[:, j, j]), color=BEFORE, lw=0.9, label="baseline")
-            ax.loglog(f, np.abs(view.extended[:, j, j]), color=AFTER, lw=0.9, label="extended")
-            ax.loglog(f, np.maximum(view.measured_std[:, j, j], 1e-12), color=MEASURED, lw=0.6, ls=":", label="measured σ")
+            _draw_response(ax, view, j, j, 4.0)
             ax.set_title(joints[j], fontsize=8)
-            ax.set_ylim(bottom=max(1e-7, float(np.abs(view.measured[:, j, j]).min()) * 1e-4))
-        axes[-1][0].set_xlabel("frequency, Hz")
+        fig.supxlabel("frequency, Hz", fontsize=8)
+        fig.supylabel("(rad/s²)/(N m)", fontsize=8)
+        _legend(fig, axes[0][0])
+        return _svg(fig)
+
+
+def frf_picture(view: FrfView, joints: tuple[str, ...], shown: list[str]) -> bytes:
+    """Diagonal entries of some joints as PNG on black, for the recording."""
+    style = {key: DARK.get(value, value) for key, value in STYLE.items()}
+    with plt.rc_context(style | {"font.size": 9}):
+        fig, axes = plt.subplots(1, len(shown), figsize=(5 * len(shown), 3.1), squeeze=False, layout="constrained")
+        for name, ax in zip(shown, axes.flat, strict=True):
+            j = joints.index(name)
+            _draw_response(ax, view, j, j, 4.0, DARK)
+            ax.set_title(name, fontsize=9)
+            ax.set_xlabel("frequency, Hz")
         axes[0][0].set_ylabel("(rad/s²)/(N m)")
-        axes[0][0].legend(fontsize=6, frameon=False)
+        _legend(fig, axes[0][0])
+        buffer = io.BytesIO()
+        fig.savefig(buffer, format="png", dpi=150, facecolor="#0d0d0d")
+        plt.close(fig)
+        return buffer.getvalue()
+
+
+def frf_grid_figure(view: FrfView, joints: tuple[str, ...]) -> str:
+    """Gain of all entries of one operating point: torque of the column, acceleration of the row."""
+    n = len(joints)
+    with plt.rc_context(STYLE | {"xtick.labelsize": 5, "ytick.labelsize": 5}):
+        fig, axes = plt.subplots(
+            n, n, figsize=(11, 1.25 * n + 0.6), sharex=True, squeeze=False, layout="constrained"
+        )
+        for i in range(n):
+            for j in range(n):
+                _draw_response(axes[i][j], view, i, j)
+            axes[i][0].set_ylabel(joints[i], fontsize=6)
+            axes[0][i].set_title(joints[i], fontsize=6)
+        fig.supxlabel("frequency, Hz", fontsize=8)
+        _legend(fig, axes[0][0])
         return _svg(fig)
 
 
 def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...]) -> str:
-    """Residual over noise by joint and band, before and after: a heat map per state."""
-    with plt.rc_context(STYLE | {"axes.grid": False}):
-        n_op = len(spectrum.operating_points)
-        fig, axes = plt.subplots(1, 2, figsize=(10, 0.28 * n_op * len(joints) + 1.2), sharey=True, layout="constrained")
+    """Residual over noise by operating point, joint and band, before and after; and the noise."""
+    with plt.rc_context(STYLE | {"axes.grid": False, "axes.spines.left": False, "axes.spines.bottom": False}):
+        points, edges = spectrum.operating_points, spectrum.band_edges_hz
+        n, rows = len(joints), len(points) * len(joints)
+        fig, axes = plt.subplots(1, 3, figsize=(11, 0.17 * rows + 1.5), sharey=True, layout="constrained")
         noise = np.maximum(spectrum.noise, 1e-12)
-        top = max(10.0, float((spectrum.before / noise).max()))
-        labels = [f"{op}  {j}" for op in spectrum.operating_points for j in joints]
-        for ax, data, title in zip(axes, (spectrum.before, spectrum.after), ("baseline", "extended"), strict=True):
-            ratio = (data / noise).reshape(-1, data.shape[-1])
-            image = ax.imshow(ratio, aspect="auto", norm=LogNorm(1.0, top), cmap="magma_r")
-            edges = spectrum.band_edges_hz
-            ax.set_xticks(range(len(edges) - 1), [f"{a:.3g}–{b:.3g}" for a, b in zip(edges[:-1], edges[1:], strict=True)], rotation=40, ha="right", fontsize=6)
-            ax.set_yticks(range(len(labels)), labels, fontsize=6)
-            ax.set_title(f"{title}: residual over noise", fontsize=8)
+        top = max(10.0, float(np.nanmax(spectrum.before / noise)))
+        ratio = {"norm": LogNorm(1.0, top, clip=True), "cmap": "YlOrRd"}
+        panels = (
+            ("baseline: residual ÷ noise", spectrum.before / noise, ratio),
+            ("extended: residual ÷ noise", spectrum.after / noise, ratio),
+            ("noise, N m", noise, {"norm": LogNorm(), "cmap": "GnBu"}),
+        )
+        images = []
+        for ax, (title, data, options) in zip(axes, panels, strict=True):
+            images.append(ax.imshow(data.reshape(rows, -1), aspect="auto", interpolation="nearest", **options))
+            for line in range(n, rows, n):
+                ax.axhline(line - 0.5, color=INK, lw=0.6)
+            names = [f"{a:.2g}–{b:.2g}" for a, b in pairwise(edges)]
+            ax.set_xticks(range(len(names)), names, rotation=45, ha="right", rotation_mode="anchor", fontsize=6)
+            ax.tick_params(length=0)
+            ax.set_title(title, fontsize=8)
             ax.set_xlabel("band, Hz")
-        fig.colorbar(image, ax=axes, shrink=0.8)
+        axes[0].set_yticks(range(rows), [f"{point}  {joint}" for point in points for joint in joints], fontsize=6)
+        for image, ax in ((images[1], axes[:2]), (images[2], axes[2:])):
+            bar = fig.colorbar(image, ax=ax, aspect=30, pad=0.01)
+            bar.outline.set_visible(False)
+            bar.ax.tick_params(which="both", labelsize=6)
         return _svg(fig)
 
 
 def evidence_figure(plot: EvidencePlot) -> str:
     """Residual torque against the variable that explains it."""
     with plt.rc_context(STYLE):
-        fig, ax = plt.subplots(figsize=(5.2, 3.1), layout="constrained")
-        ax.plot(*_thin(plot.x, plot.y), ".", ms=1.8, alpha=0.5, color=MEASURED, label="residual without the cause", rasterized=True)
-        ax.plot(*_thin(plot.model_x, plot.model_y), ".", ms=1.8, alpha=0.6, color=AFTER, label="fitted effect", rasterized=True)
+        fig, ax = plt.subplots(figsize=(5.2, 3.3), layout="constrained")
+        ax.plot(*_thin(plot.x, plot.y), ".", ms=2.2, mew=0, alpha=0.45, color=MEASURED, label="residual without the cause")
+        ax.plot(*_thin(plot.model_x, plot.model_y), ".", ms=2.2, mew=0, alpha=0.7, color=AFTER, label="fitted effect")
         ax.set_xlabel(plot.x_label)
         ax.set_ylabel(plot.y_label)
-        ax.set_title(plot.title, fontsize=9)
-        ax.legend(fontsize=7, frameon=False, markerscale=4)
+        _legend(fig, ax)
         return _svg(fig)
 
 
@@ -97,14 +206,16 @@ def trace_figure(trace: TorqueTrace, joints: tuple[str, ...]) -> str:
     scale = np.maximum(trace.measured.std(axis=0), 1e-9)
     worst = np.sort(np.argsort(-before / scale)[: min(3, len(joints))])
     with plt.rc_context(STYLE):
-        fig, axes = plt.subplots(len(worst), 1, figsize=(10, 1.5 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained")
+        fig, axes = plt.subplots(len(worst), 1, figsize=(11, 1.4 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained")
         step = max(1, len(trace.t) // POINTS)
         for ax, j in zip(axes.flat, worst, strict=True):
             t = trace.t[::step]
-            ax.plot(t, (trace.measured - trace.before)[::step, j], color=BEFORE, lw=0.7, label="error before")
-            ax.plot(t, (trace.measured - trace.after)[::step, j], color=AFTER, lw=0.7, label="error after")
-            ax.set_ylabel(f"{joints[j]}\nN m", fontsize=7)
-        axes[0][0].legend(fontsize=7, frameon=False, ncols=2)
+            ax.plot(t, (trace.measured - trace.before)[::step, j], color=BEFORE, lw=0.7, label="error of the baseline")
+            ax.plot(t, (trace.measured - trace.after)[::step, j], color=AFTER, lw=0.7, label="error of the extended model")
+            ax.set_title(joints[j], fontsize=8, loc="left")
+            ax.set_ylabel("N m")
+            ax.margins(x=0)
+        _legend(fig, axes[0][0])
         axes[-1][0].set_xlabel("time, s")
         return _svg(fig)
 

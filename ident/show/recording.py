@@ -10,7 +10,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ident.graybox import build_structure
+from ident.show.figures import frf_picture, rounded, unit_suffix
 from ident.verdict import Diagnosis, TorqueTrace
+from robot_assets.robot import Robot
 
 FRAMES_PER_SECOND = 30.0
 COLORS = {"measured": [150, 150, 150], "before": [200, 85, 61], "after": [42, 127, 158]}
@@ -26,7 +28,8 @@ def write_recording(diagnosis: Diagnosis, path: Path) -> None:
         _log_torques(stream, trace, diagnosis.joints)
         _log_arm(stream, diagnosis, trace)
     for view in diagnosis.frf[:1]:
-        _log_frf(stream, view, diagnosis.joints)
+        picture = frf_picture(view, diagnosis.joints, _worst_joints(diagnosis)[:2])
+        stream.log("frf", rr.EncodedImage(contents=picture, media_type="image/png"), static=True)
     stream.flush()
     stream.disconnect()
 
@@ -36,14 +39,14 @@ def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, N m")]
     torques += [rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, N m") for name in joints]
     responses = [
-        rrb.Spatial2DView(origin=f"frf/{name}", name=f"{name}: log FRF") for name in joints[:2] if diagnosis.frf
+        rrb.Spatial2DView(origin="frf", name=f"FRF at {view.operating_point}, linear part") for view in diagnosis.frf[:1]
     ]
     left = rrb.Vertical(
         rrb.TextDocumentView(origin="verdict", name="verdict"),
-        rrb.Spatial3DView(origin="arm", name="arm", background=[245, 245, 243]),
+        rrb.Spatial3DView(origin="arm", name="arm"),
         row_shares=[2, 3],
     )
-    right = rrb.Vertical(*torques, rrb.Horizontal(*responses)) if responses else rrb.Vertical(*torques)
+    right = rrb.Vertical(*torques, *responses, row_shares=[1.0] * len(torques) + [1.6] * len(responses))
     return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[2, 3]), collapse_panels=True)
 
 
@@ -58,12 +61,18 @@ def _worst_joints(diagnosis: Diagnosis) -> list[str]:
 
 def _markdown(diagnosis: Diagnosis) -> str:
     v = diagnosis.verdict
-    rows = [f"# {v.sentence}", ""]
+    rows = [f"## {v.sentence}", ""]
     for c in v.causes:
-        values = ", ".join(f"{k} = {x.value:.4g} ± {x.std:.2g} {x.unit}" for k, x in c.parameters.items())
+        values = ", ".join(f"{k} = {rounded(x.value, x.std)}{unit_suffix(x.unit)}" for k, x in c.parameters.items())
         rows += [f"**{c.effect.replace('_', ' ')} at {c.joint}**, probability {c.probability:.3f}: {values}", "", c.evidence, ""]
     if v.gain is not None:
-        rows.append(f"Torque error on held-out data {v.gain.before:.3g} → {v.gain.after:.3g} N m, noise {v.gain.noise_floor:.3g} N m.")
+        g = v.gain
+        interval = "" if g.ci95 is None else f" (95 % interval {g.ci95[0]:.1%} to {g.ci95[1]:.1%} of the gap closed)"
+        rows.append(
+            f"Torque error on held-out data {g.before:.3g} → {g.after:.3g} N m, noise {g.noise_floor:.3g} N m{interval}."
+        )
+    if v.next_experiment:
+        rows.append(f"\n**Next experiment.** {v.next_experiment}")
     rows.append(f"\nUnexplained: {v.unexplained_verdict} ({v.unexplained_share:.1%}).")
     return "\n".join(rows)
 
@@ -111,12 +120,16 @@ def _log_arm(stream: rr.RecordingStream, diagnosis: Diagnosis, trace: TorqueTrac
             stream.log("arm/skeleton", rr.LineStrips3D([track[i]], radii=0.02, colors=[90, 100, 110]))
 
 
-def _log_meshes(stream: rr.RecordingStream, robot) -> bool:
-    """Collision meshes under the joint frames that carry them; False where a file is missing."""
+def _log_meshes(stream: rr.RecordingStream, robot: Robot) -> bool:
+    """Collision meshes under the driven joints that carry them; False where no file is found."""
     try:
         full = pin.buildModelFromUrdf(str(robot.urdf))
-        shapes = pin.buildGeomFromUrdf(full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=[str(robot.mesh_dir or robot.folder)])
-    except Exception:
+        shapes = pin.buildGeomFromUrdf(
+            full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=[str(robot.mesh_dir or robot.folder)]
+        )
+        fixed = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
+        full, shapes = pin.buildReducedModel(full, shapes, fixed, _locked(full, robot))
+    except Exception:  # Pinocchio raises many types for URDFs whose meshes are not there
         return False
     found = False
     for shape in shapes.geometryObjects:
@@ -137,16 +150,10 @@ def _log_meshes(stream: rr.RecordingStream, robot) -> bool:
     return found
 
 
-def _log_frf(stream: rr.RecordingStream, view, joints: tuple[str, ...]) -> None:
-    """FRF magnitudes as curves over the logarithm of frequency (x) and of gain (y, upwards)."""
-    for j, name in enumerate(joints):
-        top = 20 * np.log10(np.abs(view.measured[:, j, j]).max())
-        x = 40 * np.log10(view.frequency / view.frequency[0])
-        for kind, G in (("measured", view.measured), ("before", view.baseline), ("after", view.extended)):
-            y = top - 20 * np.log10(np.maximum(np.abs(G[:, j, j]), 1e-12))
-            curve = np.stack([x, y], axis=1)
-            entity = f"frf/{name}/{kind}"
-            if kind == "measured":
-                stream.log(entity, rr.Points2D(curve, radii=0.45, colors=COLORS[kind]), static=True)
-            else:
-                stream.log(entity, rr.LineStrips2D([curve], radii=0.25, colors=COLORS[kind]), static=True)
+def _locked(model: pin.Model, robot: Robot) -> np.ndarray:
+    """Neutral configuration with the locked joints in place."""
+    q = pin.neutral(model)
+    for name, value in robot.locked.items():
+        joint = model.joints[model.getJointId(name)]
+        q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)] if joint.nq == 2 else [value]
+    return q

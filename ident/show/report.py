@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-from ident.show.figures import evidence_figure, frf_figure, trace_figure, where_figure
-from ident.verdict import Diagnosis
+from ident.show.figures import (
+    evidence_figure,
+    frf_figure,
+    frf_grid_figure,
+    rounded,
+    trace_figure,
+    unit_suffix,
+    where_figure,
+)
+from ident.verdict import Diagnosis, FrfView, Value
 
 MAX_FRFS = 3
 MAX_TRACES = 2
+KINDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
 
 def write_report(diagnosis: Diagnosis, path: Path) -> None:
@@ -22,9 +32,33 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
     html = environment.get_template("report.html.j2").render(
         d=diagnosis,
         v=diagnosis.verdict,
+        kinds=KINDS,
+        rounded=rounded,
+        unit_suffix=unit_suffix,
+        table=parameter_table(diagnosis.verdict.baseline),
+        grid=[(view.operating_point, frf_grid_figure(view, joints)) for view in _worst(diagnosis.frf)[:1]],
         frfs=[(view.operating_point, frf_figure(view, joints)) for view in diagnosis.frf[:MAX_FRFS]],
         where=where_figure(diagnosis.spectrum, joints) if diagnosis.spectrum else None,
         evidence={p.cause: evidence_figure(p) for p in diagnosis.evidence},
         traces=[(t.segment, trace_figure(t, joints)) for t in diagnosis.traces[:MAX_TRACES]],
     )
     path.write_text(html, encoding="utf-8")
+
+
+def parameter_table(baseline: dict[str, Value]) -> dict[str, dict[str, Value]]:
+    """Baseline parameters by joint (or hinge) and kind."""
+    rows: dict[str, dict[str, Value]] = {}
+    for name, value in baseline.items():
+        kind, place = name.split(".", 1)
+        rows.setdefault(place, {})[kind] = value
+    return rows
+
+
+def _worst(views: tuple[FrfView, ...]) -> list[FrfView]:
+    """Views by how far the baseline is from the measurement, in standard deviations."""
+
+    def distance(view: FrfView) -> float:
+        error = np.abs(view.measured - view.baseline) / np.maximum(view.measured_std, 1e-12)
+        return -float(np.nanmedian(error))
+
+    return sorted(views, key=distance)
