@@ -43,11 +43,33 @@ def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     ]
     left = rrb.Vertical(
         rrb.TextDocumentView(origin="verdict", name="verdict"),
-        rrb.Spatial3DView(origin="arm", name="arm"),
+        rrb.Spatial3DView(origin="arm", name="arm", eye_controls=_eye(diagnosis)),
         row_shares=[2, 3],
     )
     right = rrb.Vertical(*torques, *responses, row_shares=[1.0] * len(torques) + [1.6] * len(responses))
     return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[2, 3]), collapse_panels=True)
+
+
+def _eye(diagnosis: Diagnosis) -> rrb.EyeControls3D | None:
+    """A view from the side of the arm that holds its whole motion."""
+    if not diagnosis.traces:
+        return None
+    structure = build_structure(diagnosis.robot)
+    data, q = structure.model.createData(), np.zeros(structure.model.nq)
+    trace = diagnosis.traces[0].q
+    points = []
+    for row in trace[:: max(1, len(trace) // 50)]:
+        q[structure.driven] = row
+        pin.forwardKinematics(structure.model, data, q)
+        points.append([M.translation.copy() for M in data.oMi])
+    points = np.array(points)
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    x, y = (points[:, -1] - points[:, 0]).mean(axis=0)[:2]
+    aside = np.array([y, -x, 0.0]) if np.hypot(x, y) > 1e-3 else np.array([1.0, -1.0, 0.0])
+    direction = aside / np.linalg.norm(aside) + [0.0, 0.0, 0.35]
+    centre = (low + high) / 2
+    distance = 1.3 * max(float(np.linalg.norm(high - low)), 0.4)
+    return rrb.EyeControls3D(position=centre + distance * direction, look_target=centre, eye_up=[0.0, 0.0, 1.0])
 
 
 def _worst_joints(diagnosis: Diagnosis) -> list[str]:
