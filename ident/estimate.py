@@ -19,8 +19,10 @@ from robot_assets.errors import DataError
 
 ESTIMATORS = ("nls", "wnls", "lls", "wlls")
 LOG_SNR = 3.0  # entries below this ratio of size to deviation are left out of log criteria
-UNDETERMINED = 0.2
+UNDETERMINED = 0.2  # relative standard deviation
+UNSEEN = 1e4
 ROUNDS = 3  # linearisations anew at the equilibrium of the last estimate
+NULL = 1e-12  # share of the scaled information below which a direction counts as unseen
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,10 @@ class Estimate:
 
     Attributes:
         parameters: at the minimum. names: of the log-coordinates, timing last.
-        covariance: (p, p) sandwich covariance of the log-coordinates.
-        cost: of the criterion. residuals: count of complex residuals.
+        covariance: (p, p) sandwich covariance of the log-coordinates (timing in s), for the
+            weighted criteria scaled by the misfit where that exceeds one. A direction that the
+            data do not see has variance ``UNSEEN``.
+        cost: of the criterion. residuals: count of complex residuals, masked ones left out.
         undetermined: names whose relative deviation exceeds ``UNDETERMINED``.
     """
 
@@ -58,6 +62,7 @@ def fit_frf(
     hold: str,
     estimator: str = "wlls",
     starts: Sequence[Parameters] | None = None,
+    seed: int = 0,
 ) -> Estimate:
     """Fit log-parameters to the FRFs of all operating points.
 
@@ -65,33 +70,56 @@ def fit_frf(
 
     Args:
         nominal: starting guesses, and centre of the starts drawn where none are given.
+        sample_time: s. hold: of the recorded torque, "zoh" or "none".
+        seed: of the drawn starts.
 
     Raises:
-        DataError: for an estimator that there is not.
+        DataError: for an estimator that there is not, an arm of another number of motors, or a
+            weighted criterion and FRFs without covariance.
     """
     if estimator not in ESTIMATORS:
         raise DataError("estimator", "fit_frf", repr(estimator), f"one of {ESTIMATORS}")
-    starts = tuple(starts) if starts is not None else _starts(nominal)
+    if frf.G.shape[-1] != structure.n:
+        raise DataError("FRF", "fit_frf", f"{frf.G.shape[-1]} motors", f"{structure.n}, those of the arm")
+    if estimator in ("wnls", "wlls") and not np.all(np.einsum("qfii->qfi", frf.covariance).real > 0):
+        raise DataError("covariance", "fit_frf", "an entry without variance", "a positive one for each")
+    starts = tuple(starts) if starts else _starts(nominal, seed)
     found = [_minimise(structure, frf, p, sample_time, hold, "lls", 40) for p in starts]
     best = min(found, key=lambda f: f[1])[0]
-    for _ in range(ROUNDS if estimator != "lls" else 1):
+    for _ in range(ROUNDS):
         best, cost = _minimise(structure, frf, best, sample_time, hold, estimator, 60)
-    r, J, C = _whole(structure, frf, best, sample_time, hold, estimator)
+    J, C = _whole(structure, frf, best, sample_time, hold, estimator)
     H = np.einsum("kip,kij,kjq->pq", J.conj(), C["W"], J, optimize=True).real
     WLW = C["W"] @ C["Lambda"] @ C["W"]
     B = 0.5 * np.einsum("kip,kij,kjq->pq", J.conj(), WLW, J, optimize=True).real
-    inverse = np.linalg.pinv(H, hermitian=True, rcond=1e-13)
-    covariance = inverse @ B @ inverse
+    covariance = _sandwich(H, B)
+    count = int(C["mask"].sum())
+    if estimator in ("wnls", "wlls"):
+        covariance *= max(1.0, cost / max(count - len(H) / 2, 1.0))
     names = (*parameter_names(structure.robot), "timing")
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:-1]
-    return Estimate(
-        best, names, covariance, cost, r.size, tuple(n for n, s in zip(names[:-1], std, strict=True) if not s < UNDETERMINED), estimator
-    )
+    loose = tuple(n for n, s in zip(names[:-1], std, strict=True) if not s < UNDETERMINED)
+    return Estimate(best, names, covariance, cost, count, loose, estimator)
 
 
-def _starts(nominal: Parameters) -> tuple[Parameters, ...]:
+def _sandwich(H: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """``H^-1 B H^-1``, with variance ``UNSEEN`` along directions that the information lacks.
+
+    A pseudo-inverse would give those directions the variance zero, the very reverse of the truth.
+    """
+    d = np.sqrt(np.diag(H))
+    d = np.where(d > 0, d, 1.0)
+    value, vector = np.linalg.eigh(H / np.outer(d, d))
+    seen = value > NULL * max(value[-1], 1e-300)
+    inverse = (vector[:, seen] / value[seen]) @ vector[:, seen].T / np.outer(d, d)
+    lost = vector[:, ~seen] / d[:, None]
+    lost = lost / np.linalg.norm(lost, axis=0)
+    return inverse @ B @ inverse + UNSEEN * lost @ lost.T
+
+
+def _starts(nominal: Parameters, seed: int) -> tuple[Parameters, ...]:
     x = nominal.to_log()
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     return (nominal, *(nominal.with_log(x + rng.uniform(-0.7, 0.7, len(x))) for _ in range(2)))
 
 
@@ -120,12 +148,12 @@ def _weights(frf: FRF, estimator: str) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 def _whole(
     structure: Structure, frf: FRF, par: Parameters, sample_time: float, hold: str, estimator: str
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Residual (Q F, n n), its derivative (Q F, n n, p), and weight and covariance."""
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Derivative of the residual (Q F, n n, p), and weight, covariance and mask."""
     W, Lambda, mask = _weights(frf, estimator)
     lins = [linearise(structure, equilibrium(structure, par, q)) for q in frf.q0]
-    r, J = _residual(structure, frf, par, lins, sample_time, hold, estimator, mask)
-    return r, J, {"W": W, "Lambda": Lambda}
+    _, J = _residual(structure, frf, par, lins, sample_time, hold, estimator, mask)
+    return J, {"W": W, "Lambda": Lambda, "mask": mask}
 
 
 def _residual(structure, frf, par, lins, sample_time, hold, estimator, mask) -> tuple[np.ndarray, np.ndarray]:

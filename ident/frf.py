@@ -15,12 +15,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import digamma
 
 from ident.dataset import Dataset, Segment
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("auto", "h1", "jio", "ari", "har", "log")
-SMOOTH = 3  # lines on either side over which a covariance of too few realizations is smoothed
+SMOOTH = 3  # lines on either side over which a covariance of few degrees of freedom is smoothed
+ENOUGH = 8  # degrees of freedom from which a variance is taken as it is
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class FRF:
         total_std: (Q, F, n, n) with stochastic nonlinear distortion where realizations show it.
         frequency: (F,) Hz. lines: (F,).
         operating_points: names. q0: (Q, n) rad, mean motor position.
-        amplitude: relative level. realizations, periods: averaged.
+        amplitude: relative level. realizations, periods: averaged; the fewest of all points.
         estimator: of ``ESTIMATORS``.
     """
 
@@ -61,6 +63,11 @@ class Blocks:
     R: np.ndarray | None
 
 
+def frf_levels(dataset: Dataset, *, role: str = "identification") -> tuple[float, ...]:
+    """Excitation levels of the multisine segments of a role, highest first."""
+    return tuple(sorted({float(s.amplitude) for s in _periodic(dataset, role)}, reverse=True))
+
+
 def estimate_frf(
     dataset: Dataset, *, estimator: str = "auto", role: str = "identification", amplitude: float | None = None
 ) -> FRF:
@@ -71,30 +78,32 @@ def estimate_frf(
         amplitude: level; the highest where None.
 
     Raises:
-        DataError: where no point has n independent experiments at that level.
+        DataError: where nothing was recorded at that level, a point has fewer than n experiments or
+            experiments that do not excite every input, or JIO has no reference.
     """
     if estimator not in ESTIMATORS:
         raise DataError("estimator", "estimate_frf", repr(estimator), f"one of {ESTIMATORS}")
-    segments = [s for s in dataset.select(role=role, kind="multisine") if len(s.excited_lines)]
+    segments = _periodic(dataset, role)
     if not segments:
         raise DataError("multisine segments", dataset.name, f"none of role {role}", "at least n per operating point")
     level = max(s.amplitude for s in segments) if amplitude is None else amplitude
     chosen = [s for s in segments if np.isclose(s.amplitude, level)]
+    if not chosen:
+        raise DataError("amplitude", dataset.name, f"{level:g}", f"one of {frf_levels(dataset, role=role)}")
     points: dict[str, list[Segment]] = {}
     for s in chosen:
         points.setdefault(str(s.operating_point), []).append(s)
     lines = _common_lines(chosen, dataset)
     frequency = lines * dataset.sample_rate / chosen[0].period
-    out = []
-    for name, members in points.items():
-        blocks = _blocks(members, lines, frequency, dataset.n, name)
-        if estimator == "jio" and blocks.R is None:
-            raise DataError("r", name, "no reference", "r columns, which JIO needs")
-        kind = estimator if estimator != "auto" else ("ari" if blocks.R is None else "jio")
-        out.append((name, blocks, kind, np.mean([s.periodic("q").mean(axis=(0, 1)) for s in members], axis=0)))
-    results = [average(b, kind) for _, b, kind, _ in out]
-    spreads = [_covariance(b, G) for (_, b, _, _), G in zip(out, results, strict=True)]
     n = dataset.n
+    blocks = [_blocks(members, lines, frequency, n, name) for name, members in points.items()]
+    without = [name for name, b in zip(points, blocks, strict=True) if b.R is None]
+    if estimator == "jio" and without:
+        raise DataError("r", f"operating point {without[0]}", "no reference of full rank", "r columns, which JIO needs")
+    kind = estimator if estimator != "auto" else ("ari" if without else "jio")
+    results = [average(b, kind) for b in blocks]
+    power = _sample_power(dataset, chosen[0].period, frequency)
+    spreads = [_covariance(b, G, kind, power) for b, G in zip(blocks, results, strict=True)]
     diag = [tuple(_unvec(np.einsum("fii->fi", c).real, n) for c in pair) for pair in spreads]
     return FRF(
         G=np.stack(results),
@@ -103,12 +112,12 @@ def estimate_frf(
         total_std=np.sqrt(np.stack([d[1] for d in diag])),
         frequency=frequency,
         lines=lines,
-        operating_points=tuple(name for name, *_ in out),
-        q0=np.stack([q for *_, q in out]),
+        operating_points=tuple(points),
+        q0=np.stack([np.mean([s.periodic("q").mean(axis=(0, 1)) for s in m], axis=0) for m in points.values()]),
         amplitude=float(level),
-        realizations=out[0][1].U.shape[0],
-        periods=out[0][1].U.shape[1],
-        estimator=out[0][2],
+        realizations=min(b.U.shape[0] for b in blocks),
+        periods=min(b.U.shape[1] for b in blocks),
+        estimator=kind,
     )
 
 
@@ -127,6 +136,19 @@ def average(blocks: Blocks, estimator: str) -> np.ndarray:
     phase = mean / np.maximum(np.abs(mean), 1e-300)
     ratio = np.where(each == 0, 1e-300, each) / phase
     return np.exp(np.log(ratio).mean(axis=0)) * phase
+
+
+def _periodic(dataset: Dataset, role: str) -> list[Segment]:
+    return [s for s in dataset.select(role=role, kind="multisine") if len(s.excited_lines)]
+
+
+def _sample_power(dataset: Dataset, period: int, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Power (F, n) that white sample noise leaves in a line of torque and of acceleration."""
+    robot = dataset.robot
+    tau = np.asarray(robot.array("tau_std") if dataset.tau_std is None else dataset.tau_std, float)
+    q = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
+    one = np.ones((len(frequency), 1))
+    return one * tau**2 / period, (2 * np.pi * frequency[:, None]) ** 4 * q**2 / period
 
 
 def _common_lines(segments: list[Segment], dataset: Dataset) -> np.ndarray:
@@ -163,55 +185,108 @@ def _blocks(members: list[Segment], lines: np.ndarray, frequency: np.ndarray, n:
         Y.append(np.stack([spectra(s, "q") for s in chosen], axis=-1) * acceleration[:, None, None])
         if with_r:
             R.append(np.stack([spectra(s, "r").mean(axis=0) for s in chosen], axis=-1))
+    if np.any(np.linalg.cond(np.mean(U, axis=1)) > 1e8):
+        raise DataError("tau", f"operating point {name}", "experiments that are not independent", f"{n} independent ones")
     reference = np.stack(R) if with_r else None
     if reference is not None and np.any(np.linalg.cond(reference) > 1e8):
         reference = None
     return Blocks(np.stack(U), np.stack(Y), reference)
 
 
-def _covariance(blocks: Blocks, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _covariance(
+    blocks: Blocks, G: np.ndarray, estimator: str = "ari", sample_power: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Noise and total covariance of vec G, each (F, n n, n n).
 
-    Noise: scatter of ``(Y_p - G U_p) U^-1`` between periods. Total: scatter of ``Y U^-1`` between
-    realizations, never below the noise; with a single realization they are the same. Sample
-    covariances of low rank are smoothed over neighbouring lines (theory.md 3.4).
+    To first order ``G_hat - G = sum_m E_m A_m`` with the output error ``E = Y - G U`` and ``A_m`` of
+    ``_gains``. The experiments share one covariance ``Phi`` (n, n) of a column of ``E``, hence
+    ``Cov vec G_hat = (sum_m A_m^T conj(A_m)) kron Phi``: far fewer unknowns than the scatter of
+    vec G itself has, which two periods could not give (theory.md 3.4, 8.1).
+
+    Noise: ``Phi`` from the scatter of ``E`` between periods, M n (P - 1) degrees of freedom. Total:
+    from what is left of ``E`` in all realizations, (M - 1) n, never below the noise; one
+    realization cannot show nonlinear distortion, there they are the same.
+
+    Args:
+        sample_power: (F, n) power of torque and acceleration noise in a line of one period: the
+            covariance where there is neither a second period nor a second realization, else the
+            shape over frequency about which it is smoothed.
     """
     M, P, F, n, _ = blocks.U.shape
-    U_inv = np.linalg.inv(blocks.U.mean(axis=1))
-    E = (blocks.Y - G @ blocks.U) @ U_inv[:, None]
-    vec = np.swapaxes(E, -1, -2).reshape(M, P, F, n * n)
+    expected, shape = None, np.ones((F, n))
+    if sample_power is not None:
+        u, y = sample_power
+        expected = (G * u[:, None, :]) @ np.conj(np.swapaxes(G, -1, -2)) + y[:, :, None] * np.eye(n)
+        shape = np.maximum(np.einsum("fii->fi", expected).real, 1e-300)
+    A = _gains(blocks, estimator)
+    K = np.einsum("mfej,mfel->fjl", A, A.conj(), optimize=True)
+    E = blocks.Y - G @ blocks.U
+    noise = None
     if P > 1:
-        d = vec - vec.mean(axis=1, keepdims=True)
-        noise = np.einsum("mpfi,mpfj->fij", d, d.conj(), optimize=True) / (M * M * P * (P - 1))
-        noise = _smooth(noise, M * (P - 1), n * n)
-    else:
-        noise = np.zeros((F, n * n, n * n), complex)
-    if M < 2:
-        return noise, noise
-    d = vec.mean(axis=1)
-    d = d - d.mean(axis=0)
-    total = np.einsum("mfi,mfj->fij", d, d.conj(), optimize=True) / (M * (M - 1))
-    total = _smooth(total, M - 1, n * n)
-    low = np.einsum("fii->fi", total).real < np.einsum("fii->fi", noise).real
-    k = np.arange(n * n)
-    total[:, k, k] = np.where(low, np.einsum("fii->fi", noise), total[:, k, k])
-    return noise, total
+        d = E - E.mean(axis=1, keepdims=True)
+        dof = M * n * (P - 1)
+        noise = _smooth(np.einsum("mpfie,mpfke->fik", d, d.conj(), optimize=True) / (P * dof), dof, shape)
+    elif M < 2:
+        noise = expected
+    total = noise
+    if M > 1:
+        e = E.mean(axis=1)
+        total = _smooth(np.einsum("mfie,mfke->fik", e, e.conj(), optimize=True) / ((M - 1) * n), (M - 1) * n, shape)
+        if noise is not None:
+            # Distortion is smooth over frequency: its part is steadied before it is held at zero or more.
+            k = np.arange(n)
+            floor = noise[:, k, k].real
+            excess = shape * _mean_over_lines((total[:, k, k].real - floor) / shape, 2 * SMOOTH)
+            total[:, k, k] = floor + np.maximum(excess, 0.0)
+    if total is None:
+        total = np.zeros((F, n, n), complex)
+    noise = total if noise is None else noise
+    return _kron(K, noise), _kron(K, total)
 
 
-def _smooth(C: np.ndarray, dof: int, size: int) -> np.ndarray:
-    """Mean over neighbouring lines; what rank is still missing is made up on the diagonal."""
-    if dof >= 2 * size:
-        return C
-    kernel = np.ones(2 * SMOOTH + 1)
-    count = np.convolve(np.ones(len(C)), kernel, mode="same")
-    flat = C.reshape(len(C), -1)
-    out = np.stack([np.convolve(c, kernel, mode="same") for c in flat.T], axis=1) / count[:, None]
-    out = out.reshape(C.shape)
-    share = min(1.0, dof * (2 * SMOOTH + 1) / (4.0 * size))
-    k = np.arange(size)
-    mixed = share * out
-    mixed[:, k, k] = out[:, k, k]
-    return mixed
+def _gains(blocks: Blocks, estimator: str) -> np.ndarray:
+    """``A_m`` of the error ``sum_m E_m A_m`` of an average; (M, F, n_u, n)."""
+    U = blocks.U.mean(axis=1)
+    if estimator in ("h1", "jio"):
+        right = np.conj(np.swapaxes(U if estimator == "h1" else blocks.R, -1, -2))
+        return right @ np.linalg.inv((U @ right).sum(axis=0))
+    return np.linalg.inv(U) / len(U)
+
+
+def _kron(K: np.ndarray, Phi: np.ndarray) -> np.ndarray:
+    """Kronecker product line by line; (F, n n, n n)."""
+    F, n, _ = K.shape
+    return np.einsum("fjl,fik->fjilk", K, Phi).reshape(F, n * n, n * n)
+
+
+def _smooth(Phi: np.ndarray, dof: int, shape: np.ndarray) -> np.ndarray:
+    """(F, n, n) sample covariances of few degrees of freedom, steadied over neighbouring lines.
+
+    Variances: mean of the logarithms of their ratio to ``shape`` (F, n) over just enough lines,
+    freed of its bias ``digamma(dof) - ln dof``. Correlations: mean over ``SMOOTH`` lines on either side; where even
+    that is short of rank they are drawn towards zero.
+    """
+    n = Phi.shape[1]
+    k = np.arange(n)
+    variance = np.maximum(Phi[:, k, k].real, 1e-300)
+    root = np.sqrt(variance)
+    half = min(SMOOTH, int(np.ceil((ENOUGH / dof - 1) / 2)))
+    if half > 0:
+        variance = shape * np.exp(_mean_over_lines(np.log(variance / shape), half) - digamma(dof) + np.log(dof))
+    correlation = Phi / (root[:, :, None] * root[:, None, :])
+    if dof < ENOUGH * n:
+        correlation = _mean_over_lines(correlation, SMOOTH) * min(1.0, dof * (2 * SMOOTH + 1) / (ENOUGH * n))
+        correlation[:, k, k] = 1.0
+    scale = np.sqrt(variance)
+    return scale[:, :, None] * correlation * scale[:, None, :]
+
+
+def _mean_over_lines(X: np.ndarray, half: int) -> np.ndarray:
+    """Mean over ``half`` lines on either side, along the first axis."""
+    total = np.concatenate([np.zeros_like(X[:1]), np.cumsum(X, axis=0)])
+    at = np.arange(len(X))
+    low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, len(X))
+    return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (X.ndim - 1))
 
 
 def _unvec(x: np.ndarray, n: int) -> np.ndarray:
