@@ -15,17 +15,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from ident.extended import Effect, Model, predict
+from ident.extended import Effect, Model, Prediction, predict
 from ident.graybox import parameter_names
 from ident.hypotheses import Hypothesis, catalogue
 from ident.screening import Score, screen
-from ident.torque_fit import ANNEALING, Fit, Problem, fit
+from ident.torque_fit import ANNEALING, Fit, Problem, Weights, fit, make_weights, residual
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
+HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
+STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
+FINALISTS = 3  # candidates of a softened round that are fitted to the noise
 REFITS = 8  # candidates refitted in a round
-POLISH_STEPS = 15  # of the winner of a round
+POLISH_STEPS = 40  # of the winner of a round
 PER_EFFECT = 2  # of one effect, at most
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
@@ -49,7 +52,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Round:
-    """One round of attribution: what competed, and who won."""
+    """One round of attribution: what competed, and who won.
+
+    ``before`` is the model without a new cause, its cost under the weights of the candidates.
+    """
 
     before: Fit
     candidates: tuple[Candidate, ...]
@@ -84,7 +90,7 @@ def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None
     names = parameter_names(problem.structure.robot)
     start = Model(problem.structure, problem.nominal)
     best = fit(problem, start, base_names=names, annealing=ANNEALING, progress=progress)
-    if best.chi2_per_dof > DETECTION_EXCESS:
+    if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
             damping = np.maximum(par.damping, problem.nominal.damping) * factor
@@ -127,9 +133,9 @@ def attribute(
         found = attribute_once(problem, current, hypotheses, progress=progress)
         if not found.candidates:
             break
-        best = found.candidates[0]
-        fall = (current.cost - best.fit.cost) / found.scale
-        share = (current.cost - best.fit.cost) / max(current.cost - current.count, 1.0)
+        best, before = found.candidates[0], found.before
+        fall = (before.cost - best.fit.cost) / found.scale
+        share = (before.cost - best.fit.cost) / max(before.cost - before.count, 1.0)
         if fall < MIN_EVIDENCE or share < MIN_SHARE:
             break
         if best.hypothesis.decoy:
@@ -144,16 +150,34 @@ def attribute(
 
 
 def polish(problem: Problem, result: Fit) -> Fit:
-    """The winner fitted to the end."""
+    """The winner fitted to the end, under the noise that it sees itself."""
     names = parameter_names(problem.structure.robot)
     return fit(
         problem,
         result.model,
         base_names=names,
         iterations=POLISH_STEPS,
-        weights=result.weights,
         remainders=result.remainders,
     )
+
+
+def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
+    """The model fitted again under weights that bear with its error, and the relative error added.
+
+    A strong cause drives the baseline far from the truth, to where no step along a single
+    hypothesis leads back. With an error relative to the torque added to the noise the baseline
+    stays near, and hypotheses can be compared. A model near the noise is returned as it is.
+    """
+    if current.chi2_per_dof <= STRONG:
+        return current, 0.0
+    names = parameter_names(problem.structure.robot)
+    model, best, level = replace(current.model, par=problem.nominal), None, 0.0
+    for rho in ANNEALING[:-1]:
+        found = fit(problem, model, base_names=names, annealing=(rho,))
+        if best is not None and found.chi2_per_dof > STRONG:
+            break
+        model, best, level = found.model, found, rho
+    return best, level
 
 
 def attribute_once(
@@ -164,39 +188,63 @@ def attribute_once(
     progress: Callable[[str], None] | None = None,
 ) -> Round:
     """One round: screen all, refit the best, weigh them."""
-    preds = [
-        predict(current.model, g, problem.sampling, W=W, steps=0)
-        for g, W in zip(problem.groups, current.remainders, strict=True)
-    ]
-    scores = screen(problem, current, preds, hypotheses)
-    names = parameter_names(problem.structure.robot)
-    candidates = []
-    excess = max(current.cost - current.count, 1.0)
+    stage, level = soften(problem, current)
+    preds = predictions(problem, stage)
+    scores = screen(problem, stage, preds, hypotheses)
+    excess = max(stage.cost - stage.count, 1.0)
     chosen = choose(scores) if scores and scores[0].gain > WORTH_A_REFIT * excess else []
+    found = []
     for i, score in enumerate(chosen):
+        h = score.hypothesis
         if progress is not None:
-            h = score.hypothesis
             progress(f"refit {i + 1}/{len(chosen)}: {h.effect} at {h.place}")
-        effect = Effect(score.hypothesis, clip_to_bounds(score))
-        model = replace(current.model, effects=(*current.model.effects, effect))
-        try:
-            result = fit(
-                problem,
-                model,
-                base_names=names,
-                iterations=10,
-                weights=current.weights,
-                remainders=current.remainders,
-            )
-        except (np.linalg.LinAlgError, ValueError, RuntimeError):
-            continue
-        candidates.append(Candidate(score.hypothesis, result, 0.0))
-    if not candidates:
-        return Round(current, (), tuple(scores), 1.0)
-    best_cost = min(c.fit.cost for c in candidates)
-    scale = max(1.0, best_cost / current.count)
-    weighed = weigh(candidates, current.count)
-    return Round(current, tuple(weighed), tuple(scores), scale)
+        model = replace(stage.model, effects=(*stage.model.effects, Effect(h, clip_to_bounds(score))))
+        result = refit(problem, model, stage.weights, stage.remainders)
+        if result is not None:
+            found.append((h, result))
+    before = current
+    if level > 0:
+        sharp = make_weights(problem, preds, 0.0)
+        before = replace(current, cost=cost_under(problem, current, sharp), weights=sharp)
+        steps = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
+        finalists = sorted(found, key=lambda x: x[1].cost)[:FINALISTS]
+        found = []
+        for h, result in finalists:
+            if progress is not None:
+                progress(f"finalist: {h.effect} at {h.place}")
+            for weights in (*steps, sharp):
+                result = refit(problem, result.model, weights, result.remainders) or result
+            if result.weights is sharp:
+                found.append((h, result))
+    if not found:
+        return Round(before, (), tuple(scores), 1.0)
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in found], before.count)
+    scale = max(1.0, min(r.cost for _, r in found) / before.count)
+    return Round(before, tuple(weighed), tuple(scores), scale)
+
+
+def predictions(problem: Problem, result: Fit) -> list[Prediction]:
+    """What a fitted model predicts for the records it was fitted to."""
+    return [
+        predict(result.model, g, problem.sampling, W=W, steps=0)
+        for g, W in zip(problem.groups, result.remainders, strict=True)
+    ]
+
+
+def cost_under(problem: Problem, result: Fit, weights: Weights) -> float:
+    """Cost of a fitted model under other weights."""
+    preds = predictions(problem, result)
+    pairs = enumerate(zip(problem.groups, preds, strict=True))
+    return float(sum(np.sum(weights.apply(g, residual(group, pred)) ** 2) for g, (group, pred) in pairs))
+
+
+def refit(problem: Problem, model: Model, weights: Weights, remainders: Sequence[np.ndarray]) -> Fit | None:
+    """A candidate fitted from where screening put it; None where its model cannot be computed."""
+    names = parameter_names(problem.structure.robot)
+    try:
+        return fit(problem, model, base_names=names, iterations=10, weights=weights, remainders=remainders)
+    except (np.linalg.LinAlgError, ValueError, RuntimeError):
+        return None
 
 
 def choose(scores: Sequence[Score]) -> list[Score]:

@@ -34,7 +34,7 @@ def main() -> None:
         sys.exit(_fail("interrupted"))
     except Exception as err:
         if type(err).__module__.startswith(("click", "typer")):
-            sys.exit(_fail(getattr(err, "format_message", lambda: str(err))()))
+            sys.exit(_fail(err.format_message() if hasattr(err, "format_message") else str(err)))
         raise
 
 

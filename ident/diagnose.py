@@ -85,7 +85,7 @@ def with_measured_noise(problem: Problem, result: Fit) -> Problem:
     levels = []
     for group, W in zip(problem.groups, result.remainders, strict=True):
         pred = predict(result.model, group, problem.sampling, W=W, steps=0)
-        Z = pred.plane.record[:, None, None] * pred.plane.Z
+        Z = pred.sampled_impedance
         found = sample_noise(group, Z, problem.samples(group))
         if found is not None:
             levels.append(found)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
-from ident.graybox import Parameters, Structure, damping_diagonal, stiffness_diagonal
+from ident.graybox import Parameters, Structure, damping_diagonal, impedance, stiffness_diagonal
 from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import Hypothesis
 from ident.hypotheses.structure import Change, apply_change
@@ -23,6 +24,9 @@ from ident.inverse import (
     true_position,
 )
 from ident.records import Group
+
+
+LOOP_REFINEMENT = 2  # time grid of a gear's loop, in multiples of that of other laws
 
 
 @dataclass(frozen=True)
@@ -55,16 +59,33 @@ class Model:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model predicts for a group, and what it was computed with."""
+    """What a model predicts for a group, and what it was computed with.
+
+    ``added_stiffness`` (n,): of effects in parallel with the gears, about the motion, N m/rad.
+    """
 
     structure: Structure
     par: Parameters
     plane: Plane
     solution: Solution
     U: np.ndarray
+    added_stiffness: np.ndarray
 
     def motion(self, group: Group) -> Motion:
         return Motion(group, self.solution, self.par)
+
+    @cached_property
+    def sampled_impedance(self) -> np.ndarray:
+        """(L, n, n) recorded torque per motor position for small changes about the motion.
+
+        What noise on the position becomes in the torque residual. Gears count with their
+        equivalent stiffness: a hardening gear passes on more noise than a linear one.
+        """
+        Z = self.plane.Z
+        if np.any(self.added_stiffness):
+            stiffness = np.maximum(self.par.stiffness + self.added_stiffness, 0.05 * self.par.stiffness)
+            Z = impedance(self.structure, replace(self.par, stiffness=stiffness), self.plane.lin, self.plane.s)[0]
+        return self.plane.record[:, None, None] * Z
 
 
 def predict(
@@ -107,13 +128,9 @@ def predict_at(
         bare = Solution(Q, Q, Q, Q, Q, Q, Torques())
         Q = Q.copy()
         Q[..., j] += effect.hypothesis.law(effect.p, Motion(group, bare, par), j, par.stiffness[j])
-    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, steps=steps)
     inner = by_channel.get("link", []) + by_channel.get("spring", [])
-    for _ in range(2 if len(inner) > 1 else bool(inner)):
-        torques = _inner_torques(structure, par, plane, group, solution, inner)
-        solution = solve(
-            structure, par, plane, group, sampling, Q=Q, W=solution.W, torques=torques, steps=min(steps, 2)
-        )
+    react = partial(_inner_torques, structure, par, plane, group, effects=inner) if inner else None
+    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, react=react, steps=steps)
     U = solution.U
     motor = by_channel.get("motor", [])
     if motor:
@@ -131,7 +148,16 @@ def predict_at(
         U[..., j] = effect.hypothesis.law(
             effect.p, Motion(group, solution, par), j, par.stiffness[j], U[..., j]
         )
-    return Prediction(structure, par, plane, solution, U)
+    return Prediction(structure, par, plane, solution, U, _added_stiffness(solution, by_channel.get("spring", [])))
+
+
+def _added_stiffness(solution: Solution, effects: Sequence[Effect]) -> np.ndarray:
+    """(n,) regression of the torques of gear effects on the deflection, lines above zero, N m/rad."""
+    out = np.zeros(solution.delta.shape[-1])
+    for j in {e.hypothesis.joint for e in effects if not e.hypothesis.options.get("kinematic")}:
+        delta, torque = solution.delta[:, 1:, j], solution.torques.spring[:, 1:, j]
+        out[j] = np.sum(torque * delta.conj()).real / max(np.sum(np.abs(delta) ** 2), 1e-300)
+    return out
 
 
 def _inner_torques(
@@ -140,6 +166,7 @@ def _inner_torques(
     plane: Plane,
     group: Group,
     solution: Solution,
+    *,
     effects: Sequence[Effect],
 ) -> Torques:
     """Spring and link torques of effects, solved together with the arm they act on.
@@ -169,8 +196,7 @@ def _inner_torques(
         if h.channel == "spring" and not h.options.get("kinematic"):
             compliance = plane.A_inv[:, structure.driven[j], structure.driven[j]]
             linear = solution.delta[..., j] + compliance * (spring[..., j] - per_joint.get(j, 0.0))
-            H = _spring_loop(structure, par, plane, group, effect, linear)
-            per_joint[j] = per_joint.get(j, 0.0) + motion.lines(H)
+            per_joint[j] = per_joint.get(j, 0.0) + _spring_loop(structure, par, plane, group, effect, linear)
     for j, value in per_joint.items():
         if j >= 1000:
             link[..., structure.driven[j - 1000]] = value
@@ -182,13 +208,16 @@ def _inner_torques(
 def _spring_loop(
     structure: Structure, par: Parameters, plane: Plane, group: Group, effect: Effect, linear: np.ndarray
 ) -> np.ndarray:
+    """Spectrum (S, L) of the torque of a gear's law, in steady state with the arm."""
     j = effect.hypothesis.joint
+    group = replace(group, n_time=LOOP_REFINEMENT * group.n_time)
     code, a, b, k = effect.hypothesis.law(effect.p, None, par.stiffness[j])
     D = np.diag(damping_diagonal(structure, par))
     K = np.diag(stiffness_diagonal(structure, par)) + plane.lin.Kg
     dt = group.period_time / group.n_time
     modes = kernels.modal_compliance(plane.lin.M, D, K, int(structure.driven[j]), dt)
-    return kernels.spring_loop(code, a, b, k, group.to_time(linear[..., None])[..., 0], *modes)
+    torque = kernels.spring_loop(code, a, b, k, group.to_time(linear[..., None])[..., 0], *modes)
+    return group.to_lines(torque[..., None])[..., 0]
 
 
 def _link_view(motion: Motion, joint: int, column: int) -> Motion:

@@ -38,7 +38,7 @@ def segment_errors(
         a = predict(before, group, problem.sampling)
         b = predict(after, group, problem.sampling)
         pairs.append((a, b))
-        Z = b.plane.record[:, None, None] * b.plane.Z
+        Z = b.sampled_impedance
         S = residual_covariance(
             group, Z, tau_std=problem.tau_std, q_std=problem.q_std, samples=problem.samples(group)
         )

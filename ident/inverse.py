@@ -14,6 +14,7 @@ torque in parallel with a spring, ``L`` one on the link side, ``F`` one at the m
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,9 @@ from ident.records import Group
 
 REMAINDER_STEPS = 200  # fixed-point steps at most for the geometric remainder from a cold start
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
+REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
+REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
+REACTION_CHANGE = 1e-5  # relative change that ends them
 
 
 @dataclass(frozen=True)
@@ -227,6 +231,7 @@ def solve(
     Q: np.ndarray | None = None,
     W: np.ndarray | None = None,
     torques: Torques = Torques(),
+    react: Callable[[Solution], Torques] | None = None,
     steps: int = 0,
 ) -> Solution:
     """Recorded motor torque that the model predicts along the measured motion.
@@ -234,7 +239,9 @@ def solve(
     Args:
         Q: (S, L, n) motor position; ``true_position`` where None.
         W: (S, L, N) geometric remainder to start from; that of the arm at rest where None.
-        torques: what effects add.
+        torques: what effects add, at the start where they depend on the motion.
+        react: torques that go with a solution; the result is consistent with them. None holds
+            ``torques``.
         steps: fixed-point steps on the remainder.
     """
     if Q is None:
@@ -242,6 +249,8 @@ def solve(
     if W is None:
         W = static_remainder(structure, par, plane, group)
     relaxation, last = 1.0, np.inf
+    if react is not None:
+        torques = _settle(structure, par, plane, Q, W, torques, react)
     for _ in range(steps):
         Q_a = link_motion(structure, par, plane, Q, W, torques)
         step = geometric_remainder(structure, plane, group, Q_a) - W
@@ -249,8 +258,42 @@ def solve(
         # A large motion near a resonance of the links can overshoot: then smaller steps.
         relaxation = max(0.5 * relaxation, 0.1) if change > 0.95 * last else relaxation
         W, last = W + relaxation * step, change
+        if react is not None:
+            torques = _settle(structure, par, plane, Q, W, torques, react)
         if np.abs(step).max() < REMAINDER_CHANGE * np.abs(W).max():
             break
+    return _solution(structure, par, plane, Q, W, torques)
+
+
+def _settle(
+    structure: Structure,
+    par: Parameters,
+    plane: Plane,
+    Q: np.ndarray,
+    W: np.ndarray,
+    torques: Torques,
+    react: Callable[[Solution], Torques],
+) -> Torques:
+    """Torques that are consistent with the motion that they cause, the remainder held."""
+    last = np.inf
+    for _ in range(REACTION_STEPS):
+        new = react(_solution(structure, par, plane, Q, W, torques))
+        change = sum(float(np.sum(np.abs(np.asarray(x) - y) ** 2)) for x, y in _pairs(new, torques))
+        size = sum(float(np.sum(np.abs(x) ** 2)) for x, _ in _pairs(new, torques))
+        torques = new
+        if change <= REACTION_CHANGE**2 * size or change > last:
+            break
+        last = change
+    return torques
+
+
+def _pairs(a: Torques, b: Torques) -> tuple:
+    return (a.spring, b.spring), (a.link, b.link), (a.motor, b.motor)
+
+
+def _solution(
+    structure: Structure, par: Parameters, plane: Plane, Q: np.ndarray, W: np.ndarray, torques: Torques
+) -> Solution:
     Q_a = link_motion(structure, par, plane, Q, W, torques)
     delta = Q @ par.coupling.T - Q_a[..., structure.driven]
     tau_s = plane.C * delta + torques.spring
@@ -288,5 +331,9 @@ def baseline_jacobian(
 
 
 def coarse_group(group: Group) -> Group:
-    """The group on the grid of the geometric remainder: of low order, four points a line do."""
-    return replace(group, n_time=scipy.fft.next_fast_len(4 * len(group.omega), real=True))
+    """The group on the grid of the geometric remainder.
+
+    Products of two signals of the compared band stay below its Nyquist frequency; those of four
+    fold to its edge.
+    """
+    return replace(group, n_time=scipy.fft.next_fast_len(int(REMAINDER_POINTS * len(group.omega)), real=True))

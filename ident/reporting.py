@@ -68,7 +68,7 @@ def spectrum_map(
         pred = after[g]
         S = residual_covariance(
             group,
-            pred.plane.record[:, None, None] * pred.plane.Z,
+            pred.sampled_impedance,
             tau_std=problem.tau_std,
             q_std=problem.q_std,
             samples=problem.samples(group),

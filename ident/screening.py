@@ -18,7 +18,6 @@ from ident.inverse import Motion
 from ident.records import Group
 from ident.torque_fit import Fit, Problem, jacobian, observe_columns, residual
 
-
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
 
 

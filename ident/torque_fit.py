@@ -103,7 +103,7 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
     """Weights at the current model; ``rho`` is a relative error added to the noise."""
     whiten, covariance = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
-        Z = pred.plane.record[:, None, None] * pred.plane.Z
+        Z = pred.sampled_impedance
         S = residual_covariance(
             group, Z, tau_std=problem.tau_std, q_std=problem.q_std, samples=problem.samples(group)
         )

@@ -62,6 +62,7 @@ def build_plant(
     """
     figures = {f: robot.array(f) for f in DRIVE_FIELDS} | dict(drives or {})
     spec = mujoco.MjSpec()
+    spec.compiler.degree = False
     spec.option.timestep = timestep
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
     spec.option.gravity = list(robot.gravity)

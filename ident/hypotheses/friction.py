@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.hypotheses.kernels import bristle
 from ident.inverse import Motion
 

@@ -14,9 +14,9 @@ from ident.graybox import (
     Parameters,
     Structure,
     build_structure,
+    equilibrium,
     impedance,
     linearise,
-    equilibrium,
 )
 from ident.hypotheses.friction import direction
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
