@@ -257,6 +257,31 @@ def _demo_real(name: str, out: Path, json_: bool, quiet: bool) -> None:
     _print(result.verdict.to_dict(), json_, _verdict_text(result.verdict, out))
 
 
+@app.command("robot")
+def robot_folder(
+    urdf: Path,
+    out: Out,
+    lock: Annotated[list[str] | None, typer.Option("--lock", help="JOINT or JOINT=POSITION: does not move; several lock several.")] = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """A robot folder from a URDF, with starting guesses of the drives to edit."""
+    from robot_assets.from_urdf import write_robot
+
+    locked: dict[str, float | None] = {}
+    for entry in lock or []:
+        name, given, value = entry.partition("=")
+        try:
+            locked[name] = float(value) if given else None
+        except ValueError as err:
+            raise DataError("--lock", "command line", entry, "JOINT or JOINT=POSITION") from err
+    made, warnings = write_robot(urdf, out, locked)
+    rows = [f"{made.n} driven joints in {out / 'robot.toml'}; edit the figures marked GUESS"]
+    rows += [f"  {j.name}: {j.torque_limit:.4g} torque limit, {j.motor_inertia:.3g} motor inertia, {j.stiffness:.3g} stiffness" for j in made.joints]
+    result = {"robot": str(out), "joints": list(made.joint_names), "locked": made.locked, "warnings": list(warnings)}
+    _print(result, json_, "\n".join([*rows, *(f"warning: {w}" for w in warnings)]))
+
+
 @app.command()
 def convert(
     files: list[Path],
