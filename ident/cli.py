@@ -295,7 +295,8 @@ def convert(
     from ident.convert import convert_logs
     from ident.dataset_io import save_dataset
 
-    data = convert_logs(files, robot, map_, name=out.name)
+    with _progress(quiet or json_) as (say, _):
+        data = convert_logs(files, robot, map_, name=out.name, say=say)
     save_dataset(data, out)
     _print({"dataset": str(out), "segments": len(data.segments)}, json_, f"{len(data.segments)} segments in {out}")
 

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from ident.convert import convert_logs
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import draft_robot, write_robot
 from robot_assets.robot import load_robot
@@ -107,3 +108,139 @@ def test_a_urdf_that_cannot_be_used_is_one_clear_error(tmp_path, urdf, lock, fou
     with pytest.raises(DataError, match=found):
         write_robot(path, tmp_path / "arm", lock)
     assert not (tmp_path / "arm").exists() and not list(tmp_path.glob(".arm*"))
+
+
+# --- logs by a map
+
+
+@pytest.fixture
+def slide(tmp_path):
+    (tmp_path / "slide.urdf").write_text(LINEAR.format(axis="1 0 0", limit='effort="150" velocity="0.5"'))
+    return write_robot(tmp_path / "slide.urdf", tmp_path / "slide")[0]
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """Two turning joints, gears 50 and 100."""
+    (tmp_path / "pair.urdf").write_text(
+        """<robot name="pair"><link name="a"/>
+        <link name="b"><inertial><mass value="3"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial></link>
+        <link name="c"><inertial><origin xyz="0.2 0 0"/><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial></link>
+        <joint name="one" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+          <limit lower="-3" upper="3" effort="80" velocity="3"/></joint>
+        <joint name="two" type="revolute"><parent link="b"/><child link="c"/><origin xyz="0.4 0 0"/><axis xyz="0 0 1"/>
+          <limit lower="-3" upper="3" effort="40" velocity="3"/></joint></robot>"""
+    )
+    write_robot(tmp_path / "pair.urdf", tmp_path / "pair")
+    toml = tmp_path / "pair" / "robot.toml"
+    toml.write_text(toml.read_text().replace("gear_ratio = 100.0", "gear_ratio = 50.0", 1))
+    return load_robot(tmp_path / "pair")
+
+
+def motion(n=2, N=1000, rate=500.0):
+    """t (N,), q, qd, tau (N, n), SI, link side: torque with inertia, friction and noise."""
+    t = np.arange(N) / rate
+    w = 2 * np.pi * np.array([0.7, 1.1, 0.5, 0.9, 1.3, 1.7, 0.6][:n])
+    q, qd, qdd = 0.8 * np.sin(w * t[:, None]), 0.8 * w * np.cos(w * t[:, None]), -0.8 * w**2 * np.sin(w * t[:, None])
+    tau = 0.5 * qdd + 4 * np.tanh(qd / 0.05) + 2 * qd + 0.05 * np.random.default_rng(0).normal(size=q.shape)
+    return t, q, qd, tau
+
+
+MAP = """sample_rate = 500.0
+[files]
+pos = "pos*.txt"
+cur = { name = "cur.dat", width = 2 }
+[columns]
+q_1 = { source = "pos:values", side = "motor" }
+q_2 = { source = "pos:values", side = "motor", plus = [{ source = "pos:values", factor = -0.02, index = 0 }] }
+tau_1 = { source = "cur:values", side = "motor", plus = [{ source = "cur:values", factor = 100.0, index = 1 }] }
+tau_2 = { source = "cur:values", side = "motor" }
+"""
+
+
+def test_a_log_over_several_files_with_coupled_gears(tmp_path, pair):
+    _, q, _, tau = motion()
+    ratio = np.array([50.0, 100.0])
+    # Motor 2 turns with both joints: q_m2 = 100 (q_2 + q_1), so torque of motor 2 also acts on joint 1.
+    motor = np.stack([50 * q[:, 0], 100 * (q[:, 0] + q[:, 1])], axis=1)
+    torque = np.stack([(tau[:, 0] - tau[:, 1]) / 50, tau[:, 1] / 100], axis=1)
+    assert np.allclose((motor * ratio**-1)[:, 1] - q[:, 0], q[:, 1])
+    for run in ("a", "b"):
+        (tmp_path / run).mkdir()
+        np.savetxt(tmp_path / run / "pos_1.txt", motor, fmt="%.12g")
+        np.savetxt(tmp_path / run / "cur.dat", torque.ravel(), fmt="%.12g")
+    (tmp_path / "map.toml").write_text(MAP)
+    files = [tmp_path / run / f for run in ("a", "b") for f in ("cur.dat", "pos_1.txt")]
+    data = convert_logs(files, pair.folder, tmp_path / "map.toml")
+    assert [s.name for s in data.segments] == ["a", "b"]
+    assert np.allclose(data.segments[1].q, q, atol=1e-9) and np.allclose(data.segments[1].tau, tau, atol=1e-9)
+    with pytest.raises(DataError, match=r"none like cur\.dat"):
+        convert_logs(files[1:2], pair.folder, tmp_path / "map.toml")
+
+
+def test_roles_and_split(tmp_path, slide):
+    t, q, _, tau = motion(1)
+    for name in ("a", "b"):
+        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([t, tau, q]), header="t u x", comments="")
+    (tmp_path / "map.toml").write_text(
+        'sample_rate = 500.0\nsplit = 0.75\n[roles]\nb = "validation"\n[time]\nsource = "t"\n'
+        '[columns]\ntau_1 = { source = "u", unit = "N" }\nq_1 = { source = "x", unit = "mm" }\n'
+    )
+    data = convert_logs([tmp_path / "a.txt", tmp_path / "b.txt"], slide.folder, tmp_path / "map.toml")
+    assert [(s.name, s.role, s.n_samples) for s in data.segments] == [
+        ("a-1", "identification", 750), ("a-2", "validation", 250), ("b", "validation", 1000),
+    ]  # fmt: skip
+    assert np.allclose(data.segments[2].q, q * 1e-3)
+
+
+def test_a_csv_with_semicolons_and_decimal_commas(tmp_path, slide):
+    (tmp_path / "log.csv").write_text("Kraft; Weg\n1,5;0,25\n-2,5;0,50\n")
+    (tmp_path / "map.toml").write_text('sample_rate = 10.0\n[columns]\ntau_1 = { source = "Kraft", unit = "N" }\nq_1 = { source = "Weg", unit = "m" }\n')
+    s = convert_logs([tmp_path / "log.csv"], slide.folder, tmp_path / "map.toml").segments[0]
+    assert s.tau[:, 0].tolist() == [1.5, -2.5] and s.q[:, 0].tolist() == [0.25, 0.5]
+
+
+def test_lost_samples_are_said_and_a_wrong_unit_of_time_is_an_error(tmp_path, slide):
+    t, q, _, tau = motion(1)
+    keep = np.r_[0:300, 340:1000]
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, tau, q])[keep], header="t u x", comments="")
+    text = 'sample_rate = 500.0\n[time]\nsource = "t"\nunit = "%s"\n[columns]\ntau_1 = { source = "u", unit = "N" }\nq_1 = { source = "x", unit = "m" }\n'
+    (tmp_path / "map.toml").write_text(text % "s")
+    said = []
+    data = convert_logs([tmp_path / "log.txt"], slide.folder, tmp_path / "map.toml", say=said.append)
+    assert len(data.segments[0].t) == 1000 and "1 gaps" in said[0] and "82 ms" in said[0]
+    for unit in ("ns", "ms"):
+        (tmp_path / "map.toml").write_text(text % unit)
+        with pytest.raises(DataError, match="unit of time"):
+            convert_logs([tmp_path / "log.txt"], slide.folder, tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ('q_1 = { source = "x", sign = "minus" }', "minus"),
+        ('q_1 = { source = "x", gear = 0 }', "zero"),
+        ('q_1 = { source = "x", plus = [{ source = "u" }] }', "factor"),
+        ('q_1 = { source = "x", unwrap = 1 }', "unwrap"),
+        ('q_1 = { source = "x", index = -1 }', "index"),
+        ('q_1 = { source = "x" }\n[multisine]\nperiod = 100', "multisine.part"),
+        ('q_1 = { source = "x" }\n[multisine]\nperiod = 100\n[[multisine.part]]\nfirst = 2', "last"),
+        ('q_1 = { source = "x" }\n[roles]\nlog = "test"', "test"),
+        ('q_1 = { source = "x" }\n[sampling]\nrate = 3', "sampling"),
+    ],
+)
+def test_a_map_that_is_wrong_is_one_clear_error(tmp_path, slide, change, found):
+    (tmp_path / "log.txt").write_text("u x\n1 2\n3 4\n")
+    (tmp_path / "map.toml").write_text('sample_rate = 500.0\n[columns]\ntau_1 = { source = "u" }\n' + change + "\n")
+    with pytest.raises(DataError, match=found):
+        convert_logs([tmp_path / "log.txt"], slide.folder, tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".txt", ".mat", ".npz", ".parquet", ".xyz"])
+@pytest.mark.parametrize("content", [b"", b"a b c\n1 2\n", b"\x00\xff" * 300, b"MATLAB 5.0 MAT-file" + b"\x01" * 500])
+def test_a_damaged_log_is_one_clear_error(tmp_path, slide, suffix, content):
+    (tmp_path / f"log{suffix}").write_bytes(content)
+    (tmp_path / "map.toml").write_text('sample_rate = 500.0\n[columns]\ntau_1 = { source = "u" }\nq_1 = { source = "x" }\n')
+    with pytest.raises(DataError) as caught:
+        convert_logs([tmp_path / f"log{suffix}"], slide.folder, tmp_path / "map.toml")
+    assert "\n" not in str(caught.value)

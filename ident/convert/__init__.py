@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,22 @@ from robot_assets.errors import DataError
 from robot_assets.robot import ASSETS, load_robot
 
 JITTER = 0.05  # of a sample, above which time stamps are resampled
+LONGEST = 100  # times as many samples as the log: beyond, the unit of time is wrong
 
 
 def convert_logs(
-    files: Sequence[Path], robot: str | Path, map_path: str | Path, *, name: str = "log"
+    files: Sequence[Path],
+    robot: str | Path,
+    map_path: str | Path,
+    *,
+    name: str = "log",
+    say: Callable[[str], None] = lambda text: None,
 ) -> Dataset:
-    """Read logs by a map; each file gives one segment, or one for each part of a multisine.
+    """Read logs by a map; each log gives one segment, one for each part of a multisine, or two by a split.
+
+    Args:
+        files: one log each, or by ``[files]`` of the map several a log (those of one folder).
+        say: told in words what was changed on the way (resampling, gaps).
 
     Raises:
         DataError: for a log, map or robot that cannot be used.
@@ -27,8 +38,8 @@ def convert_logs(
     arm = load_robot(robot)
     log_map = read_map(map_path, arm.array("gear_ratio"))
     segments: list[Segment] = []
-    for path in files:
-        segments += _segments(Path(path), log_map, arm.n)
+    for log_name, paths in _logs([Path(f) for f in files], log_map, str(map_path)):
+        segments += _segments(log_name, paths, log_map, arm.n, say)
     if len({s.name for s in segments}) < len(segments):
         raise DataError("files", str(map_path), "two logs of one name", "distinct names")
     own = (ASSETS / arm.name).resolve() == arm.folder
@@ -46,20 +57,62 @@ def convert_logs(
     )
 
 
-def _segments(path: Path, m: LogMap, n: int) -> list[Segment]:
-    wanted = {c.source for c in m.columns} | ({m.time} if m.time else set())
-    if m.excited_from:
-        wanted.add(m.excited_from)
-    data = read_log(path, wanted)
+def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str, Path]]]:
+    """Logs as (name, prefix -> file); the prefix is empty where a log is one file."""
+    if not m.files:
+        return [(path.stem, {"": path}) for path in files]
+    folders: dict[Path, dict[str, Path]] = {}
+    for path in files:
+        fits = [f.prefix for f in m.files if fnmatchcase(path.name, f.pattern)]
+        if len(fits) != 1:
+            raise DataError("[files]", where, f"{len(fits)} entries for {path.name}", "one entry for each file given")
+        log = folders.setdefault(path.parent, {})
+        if fits[0] in log:
+            raise DataError("[files]", where, f"{path.name} and {log[fits[0]].name} for {fits[0]}", "one file of a kind a folder")
+        log[fits[0]] = path
+    for folder, log in folders.items():
+        missing = [f.pattern for f in m.files if f.prefix not in log]
+        if missing:
+            raise DataError("files", str(folder), f"none like {missing[0]}", "every file that [files] of the map names")
+    if len(folders) == 1:
+        (log,) = folders.values()
+        return [(log[m.files[0].prefix].stem, log)]
+    return [(folder.name or "log", log) for folder, log in folders.items()]
+
+
+def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
+    if not m.files:
+        return read_log(paths[""], m.sources)
+    data = {}
+    for part in m.files:
+        start = f"{part.prefix}:"
+        wanted = {s.removeprefix(start) for s in m.sources if s.startswith(start)}
+        for key, x in (read_log(paths[part.prefix], wanted) if wanted else {}).items():
+            if part.width is not None:
+                if x.size % part.width:
+                    raise DataError(key, str(paths[part.prefix]), f"{x.size} values", f"a multiple of width = {part.width}")
+                x = x.reshape(-1, part.width)
+            data[start + key] = x
+    lost = sorted(m.sources - set(data))
+    if lost:
+        raise DataError("source", str(next(iter(paths.values()))), lost[0], f"a name that starts with one of {[f.prefix + ':' for f in m.files]}")
+    return data
+
+
+def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callable[[str], None]) -> list[Segment]:
+    path = next(iter(paths.values()))
+    data = _read(paths, m)
     channels = _channels(data, m, n, path)
     N = len(channels["q"])
     t = np.arange(N) / m.sample_rate
     if m.time is not None:
         stamps = data[m.time].ravel() * m.time_factor
-        channels, t = _resample(channels, stamps - stamps[0], m.sample_rate, path)
+        if len(stamps) != N:
+            raise DataError(m.time, str(path), f"{len(stamps)} time stamps", f"one for each of {N} samples")
+        channels, t = _resample(channels, stamps - stamps[0], m.sample_rate, path, say)
         N = len(t)
     if m.period is None:
-        return _motions(path, m, t, channels)
+        return _motions(name, path, m, t, channels)
     lines = np.array(m.excited_lines, int)
     if m.excited_from is not None:
         X = np.abs(np.fft.rfft(data[m.excited_from].ravel()[: m.period]))
@@ -67,12 +120,12 @@ def _segments(path: Path, m: LogMap, n: int) -> list[Segment]:
         lines = lines[(lines > 0) & (lines < m.period / 2)]
     out = []
     for i, part in enumerate(m.parts):
-        if not 1 <= part.first <= part.last or part.last * m.period > N:
+        if part.last * m.period > N:
             raise DataError("multisine.part", str(path), f"periods {part.first} to {part.last}", f"within the {N // m.period} of the log")
         pick = slice((part.first - 1) * m.period, part.last * m.period)
         out.append(
             Segment(
-                name=f"{path.stem}-{i + 1}",
+                name=f"{name}-{i + 1}",
                 kind="multisine",
                 role=part.role,
                 t=t[pick],
@@ -88,53 +141,76 @@ def _segments(path: Path, m: LogMap, n: int) -> list[Segment]:
     return out
 
 
-def _motions(path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray]) -> list[Segment]:
-    role = m.roles.get(path.stem, m.roles.get(path.name, "identification"))
-    if m.split is None:
-        return [Segment(name=path.stem, kind="trajectory", role=role, t=t, **channels)]
+def _motions(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray]) -> list[Segment]:
+    role = next((m.roles[k] for k in (name, path.stem, path.name) if k in m.roles), None)
+    if m.split is None or role is not None:
+        return [Segment(name=name, kind="trajectory", role=role or "identification", t=t, **channels)]
     cut = int(m.split * len(t))
     return [
-        Segment(name=f"{path.stem}-{k + 1}", kind="trajectory", role=r, t=t[s], **{c: v[s] for c, v in channels.items()})
+        Segment(name=f"{name}-{k + 1}", kind="trajectory", role=r, t=t[s], **{c: v[s] for c, v in channels.items()})
         for k, (r, s) in enumerate((("identification", slice(0, cut)), ("validation", slice(cut, None))))
     ]
 
 
 def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dict[str, np.ndarray]:
-    lengths = {len(data[c.source]) for c in m.columns}
-    if len(lengths) > 1:
-        raise DataError("signals", str(path), f"lengths {sorted(lengths)}", "one length")
-    N = lengths.pop()
     out: dict[str, np.ndarray] = {}
+    length = None
     for c in m.columns:
-        x = data[c.source]
-        if x.ndim == 2 and min(x.shape) > 1:
-            if c.index >= x.shape[1]:
-                raise DataError(c.source, str(path), f"{x.shape[1]} columns", f"column {c.index}")
-            x = x[:, c.index]
-        x = x.ravel()
-        x = x * c.factor
+        x = _signal(data[c.source], c.source, c.index, path) * c.factor
         if c.unwrap:
             x = np.unwrap(x)
-        target = out.setdefault(c.channel, np.full((N, n), np.nan if c.channel == "q_link" else 0.0))
-        target[:, c.joint] = x + c.offset
+        x = x + c.offset
+        for source, factor, index in c.plus:
+            other = _signal(data[source], source, index, path)
+            if len(other) != len(x):
+                raise DataError(source, str(path), f"{len(other)} samples", f"{len(x)} as in {c.source}")
+            x = x + factor * other
+        if length is not None and len(x) != length:
+            raise DataError(c.source, str(path), f"{len(x)} samples", f"{length} as in {m.columns[0].source}")
+        length = len(x)
+        target = out.setdefault(c.channel, np.full((length, n), np.nan if c.channel == "q_link" else 0.0))
+        target[:, c.joint] = x
     bad = [k for k, v in out.items() if k != "q_link" and not np.all(np.isfinite(v))]
     if bad:
         k = int(np.flatnonzero(~np.isfinite(out[bad[0]]).all(axis=1))[0])
         raise DataError(bad[0], str(path), f"a value that is not finite at sample {k}", "finite numbers")
+    if not length:
+        raise DataError("signals", str(path), "no samples", "at least one")
     return out
 
 
+def _signal(x: np.ndarray, name: str, index: int, path: Path) -> np.ndarray:
+    """One signal (N,) of a source; of two dimensions the longer is time."""
+    if x.ndim > 2:
+        raise DataError(name, str(path), f"{x.ndim} dimensions", "one or two")
+    if x.ndim < 2 or min(x.shape) == 1:
+        return x.ravel()
+    if x.shape[0] < x.shape[1]:
+        x = x.T
+    if index >= x.shape[1]:
+        raise DataError(name, str(path), f"{x.shape[1]} columns", f"column {index} (index counts from 0)")
+    return x[:, index]
+
+
 def _resample(
-    channels: dict[str, np.ndarray], stamps: np.ndarray, rate: float, path: Path
+    channels: dict[str, np.ndarray], stamps: np.ndarray, rate: float, path: Path, say: Callable[[str], None]
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Signals on a uniform grid; untouched where the stamps are uniform already."""
     step = np.diff(stamps)
     if not np.all(np.isfinite(stamps)) or np.any(step < 0):
         raise DataError("time", str(path), "stamps that are not finite or go back", "rising time stamps")
+    if stamps[-1] * rate > LONGEST * len(stamps) or stamps[-1] * rate < len(stamps) / LONGEST:
+        found = f"{len(stamps)} samples over {stamps[-1]:.4g} s"
+        raise DataError("time", str(path), found, f"about sample_rate = {rate:g} Hz: is the unit of time right?")
     t = np.arange(int(np.floor(stamps[-1] * rate + 1e-6)) + 1) / rate
     if len(t) == len(stamps) and np.all(np.abs(step * rate - 1) < JITTER):
         return channels, t
     keep = np.concatenate([[True], step > 0])
+    gaps = int(np.sum(step * rate > 1.5))
+    say(
+        f"{path.name}: {len(stamps)} stamped samples resampled to {len(t)} at {rate:g} Hz; {gaps} gaps, "
+        f"the longest {step.max() * 1e3:.3g} ms, {int(np.sum(~keep))} stamps twice"
+    )
     return {
         k: np.stack([np.interp(t, stamps[keep], c[keep]) for c in v.T], axis=1) for k, v in channels.items()
     }, t

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,23 +10,29 @@ from typing import Any
 import numpy as np
 
 from robot_assets.errors import DataError
+from robot_assets.values import choice, number, read_toml, show, subtable, tables, text, whole
 
 UNITS = {
     "rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "rev": 2 * np.pi, "rad/s": 1.0, "deg/s": np.pi / 180,
-    "N m": 1.0, "mN m": 1e-3, "kN m": 1e3, "N": 1.0, "A": 1.0, "mA": 1e-3, "V": 1.0, "m": 1.0, "mm": 1e-3,
-    "m/s": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "degC": 1.0,
-}
-COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]*)$")
-OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap"}
+    "rpm": np.pi / 30, "N m": 1.0, "mN m": 1e-3, "kN m": 1e3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3, "V": 1.0,
+    "m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
+    "degC": 1.0,
+}  # fmt: skip
+COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
+OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap", "plus"}
+KEYS = {"sample_rate", "input_hold", "time", "files", "columns", "multisine", "roles", "split"}
+ROLES = ("identification", "validation")
 
 
 @dataclass(frozen=True)
 class Column:
-    """``channel_joint = sign (scale unit source [+ gear, torque constant] + offset)``.
+    """``channel_joint = factor source + offset + sum of factor_k source_k``.
 
     Attributes:
         factor: everything multiplicative: unit, sign, scale, torque constant and gear ratio.
+        offset: in the unit of the dataset, added last.
         index: column of a two-dimensional source, from 0.
+        plus: (source, factor, index) of further terms: gears that couple joints.
     """
 
     channel: str
@@ -37,6 +42,11 @@ class Column:
     offset: float
     index: int
     unwrap: bool
+    plus: tuple[tuple[str, float, int], ...] = ()
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        return (self.source, *(p[0] for p in self.plus))
 
 
 @dataclass(frozen=True)
@@ -49,13 +59,35 @@ class Part:
 
 
 @dataclass(frozen=True)
+class FilePart:
+    """One of the files that a log is spread over; its signals are named ``prefix:signal``.
+
+    Attributes:
+        pattern: file name, with * and ?.
+        width: values of one sample, where the file has one value a line; else None.
+    """
+
+    prefix: str
+    pattern: str
+    width: int | None
+
+
+@dataclass(frozen=True)
 class LogMap:
-    """A whole map."""
+    """A whole map.
+
+    Attributes:
+        sample_rate: Hz, of the dataset. time_factor: s per unit of the time column.
+        files: where a log is spread over several; else empty.
+        roles: file name or its stem -> role. split: share of a file without a role that is for
+            identification, the rest validates.
+    """
 
     sample_rate: float
     input_hold: str
     time: str | None
     time_factor: float
+    files: tuple[FilePart, ...]
     columns: tuple[Column, ...]
     period: int | None
     parts: tuple[Part, ...]
@@ -65,6 +97,12 @@ class LogMap:
     excited_lines: tuple[int, ...]
     roles: dict[str, str]
     split: float | None
+
+    @property
+    def sources(self) -> set[str]:
+        """Names of all signals that the map reads."""
+        out = {s for c in self.columns for s in c.sources}
+        return out | {s for s in (self.time, self.excited_from) if s is not None}
 
 
 def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
@@ -77,51 +115,67 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
         DataError: with the key at fault.
     """
     where = str(path)
-    try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
-        raise DataError("map", where, str(err), "a readable TOML map") from err
-    rate = data.get("sample_rate")
-    if not isinstance(rate, int | float) or not 0 < rate < 1e7:
-        raise DataError("sample_rate", where, repr(rate), "Hz, above zero")
-    if data.get("input_hold", "none") not in ("zoh", "none"):
-        raise DataError("input_hold", where, repr(data["input_hold"]), '"zoh" or "none"')
+    data = read_toml(Path(path), "map")
+    stray = set(data) - KEYS
+    if stray:
+        raise DataError(min(stray), where, "an unknown key", f"one of {sorted(KEYS)}")
     entries = data.get("columns")
     if not isinstance(entries, dict) or not entries:
-        raise DataError("[columns]", where, repr(entries)[:60], 'a table such as q_1 = { source = "angle", unit = "deg" }')
+        raise DataError("[columns]", where, show(entries), 'a table such as q_1 = { source = "angle", unit = "deg" }')
     columns = tuple(_column(k, v, ratios, where) for k, v in entries.items())
     have = {(c.channel, c.joint) for c in columns}
     for channel in ("tau", "q"):
         for j in range(len(ratios)):
             if (channel, j) not in have:
                 raise DataError(f"{channel}_{j + 1}", where, "no such column", f"{channel}_1 to {channel}_{len(ratios)}")
-    time = data.get("time")
-    if time is not None and not (isinstance(time, dict) and isinstance(time.get("source"), str)):
-        raise DataError("[time]", where, repr(time), '{ source = "...", unit = "s" }')
-    multisine = data.get("multisine", {})
-    parts = tuple(
-        Part(int(p["first"]), int(p["last"]), str(p.get("role", "identification"))) for p in multisine.get("part", [])
-    )
+    time = subtable(data, "time", where)
+    multisine = subtable(data, "multisine", where)
+    parts = tuple(_part(entry, where) for entry in tables(multisine, "part", where))
+    if multisine and not parts:
+        raise DataError("[[multisine.part]]", where, "none", "the periods of at least one segment")
+    lines = multisine.get("excited_lines", [])
+    if not isinstance(lines, list) or not all(isinstance(k, int) and not isinstance(k, bool) and 0 < k < 2**53 for k in lines):
+        raise DataError("multisine.excited_lines", where, show(lines), "whole numbers from 1")
+    roles = subtable(data, "roles", where)
     return LogMap(
-        sample_rate=float(rate),
-        input_hold=data.get("input_hold", "none"),
-        time=None if time is None else time["source"],
-        time_factor=1.0 if time is None else _unit(time.get("unit", "s"), "time", where),
+        sample_rate=number(data, "sample_rate", where, low=1e-3, high=1e7),
+        input_hold=choice(data, "input_hold", where, ("zoh", "none"), "none"),
+        time=text(time, "source", where) if time else None,
+        time_factor=_unit(time.get("unit", "s"), "time", where),
+        files=tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items()),
         columns=columns,
-        period=multisine.get("period"),
+        period=whole(multisine, "period", where, low=4) if multisine else None,
         parts=parts,
-        operating_point=str(multisine.get("operating_point", "op01")),
-        excited_from=multisine.get("excited_from"),
-        excited_threshold=float(multisine.get("excited_threshold", 0.05)),
-        excited_lines=tuple(int(k) for k in multisine.get("excited_lines", [])),
-        roles={str(k): str(v) for k, v in data.get("roles", {}).items()},
-        split=data.get("split"),
+        operating_point=text(multisine, "operating_point", where, "op01"),
+        excited_from=text(multisine, "excited_from", where) if "excited_from" in multisine else None,
+        excited_threshold=number(multisine, "excited_threshold", where, low=0.0, high=1.0, default=0.05),
+        excited_lines=tuple(lines),
+        roles={k: choice(roles, k, where, ROLES) for k in roles},
+        split=number(data, "split", where, low=0.05, high=0.95) if "split" in data else None,
+    )
+
+
+def _part(entry: dict, where: str) -> Part:
+    first = whole(entry, "first", where, low=1)
+    last = whole(entry, "last", where, low=first)
+    return Part(first, last, choice(entry, "role", where, ROLES, "identification"))
+
+
+def _file(prefix: str, entry: Any, where: str) -> FilePart:
+    if isinstance(entry, str):
+        entry = {"name": entry}
+    if not isinstance(entry, dict):
+        raise DataError(f"files.{prefix}", where, show(entry), '"name of a file" or { name = "...", width = 7 }')
+    return FilePart(
+        prefix,
+        text(entry, "name", f"{where} files.{prefix}"),
+        whole(entry, "width", f"{where} files.{prefix}", low=1, default=None),
     )
 
 
 def _unit(unit: Any, key: str, where: str) -> float:
-    if unit not in UNITS:
-        raise DataError(f"unit of {key}", where, repr(unit), f"one of {list(UNITS)}")
+    if not isinstance(unit, str) or unit not in UNITS:
+        raise DataError(f"unit of {key}", where, show(unit), f"one of {list(UNITS)}")
     return UNITS[unit]
 
 
@@ -132,18 +186,34 @@ def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
     if isinstance(entry, str):
         entry = {"source": entry}
     if not isinstance(entry, dict) or not isinstance(entry.get("source"), str):
-        raise DataError(key, where, repr(entry), '{ source = "name in the log", unit = "..." }')
+        raise DataError(key, where, show(entry), '{ source = "name in the log", unit = "..." }')
     stray = set(entry) - OPTIONS
     if stray:
-        raise DataError(f"{key}.{sorted(stray)[0]}", where, "an unknown option", f"one of {sorted(OPTIONS)}")
+        raise DataError(f"{key}.{min(stray)}", where, "an unknown option", f"one of {sorted(OPTIONS)}")
     channel, joint = match[1], int(match[2]) - 1
+    here = f"{where} {key}"
     factor = _unit(entry.get("unit", "N m" if channel in ("tau", "r") else "rad"), key, where)
-    factor *= float(entry.get("sign", 1)) * float(entry.get("scale", 1.0)) * float(entry.get("torque_constant", 1.0))
-    side = entry.get("side", "link")
-    if side not in ("link", "motor"):
-        raise DataError(f"{key}.side", where, repr(side), '"link" or "motor"')
-    ratio = float(entry.get("gear", ratios[joint] if side == "motor" else 1.0))
-    factor *= ratio if channel in ("tau", "r") else 1.0 / ratio
+    for option in ("sign", "scale", "torque_constant"):
+        factor *= number(entry, option, here, default=1.0)
+    ratio = ratios[joint] if choice(entry, "side", here, ("link", "motor"), "link") == "motor" else 1.0
+    ratio = number(entry, "gear", here, default=float(ratio))
+    if ratio == 0 or factor == 0:
+        raise DataError(key, where, "a factor of zero", "gear, sign, scale and torque_constant other than zero")
+    # Torques grow by the gear ratio on the way to the link, angles shrink; a temperature has no side.
+    factor *= ratio if channel in ("tau", "r") else 1.0 if channel == "temp" else 1.0 / ratio
+    unwrap = entry.get("unwrap", False)
+    if not isinstance(unwrap, bool):
+        raise DataError(f"{key}.unwrap", where, show(unwrap), "true or false")
     return Column(
-        channel, joint, entry["source"], factor, float(entry.get("offset", 0.0)), int(entry.get("index", joint)), bool(entry.get("unwrap", False))
+        channel,
+        joint,
+        entry["source"],
+        factor,
+        number(entry, "offset", here, default=0.0),
+        whole(entry, "index", here, low=0, default=joint),
+        unwrap,
+        tuple(
+            (text(p, "source", here), number(p, "factor", here), whole(p, "index", here, low=0, default=joint))
+            for p in tables(entry, "plus", here)
+        ),
     )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,30 +14,23 @@ import pyarrow.parquet
 
 from robot_assets.errors import DataError
 
-FORMATS = (".csv", ".parquet", ".mat", ".npz")
+VALUES = "values"  # name of the whole table of a text file without a header
+DEEPEST = 8  # structures inside structures that are looked into
+Signals = dict[str, np.ndarray]
 
 
-def read_log(path: Path, wanted: set[str]) -> dict[str, np.ndarray]:
+def read_log(path: Path, wanted: set[str]) -> Signals:
     """The wanted signals of a log; a dot reaches into structures ("rec.act_pos").
 
     Raises:
         DataError: where the file is missing, of another format, unreadable, or lacks a signal.
     """
-    if not path.is_file():
-        raise DataError("log", str(path), "no such file", f"a file of {FORMATS}")
-    try:
-        data = _readers()[path.suffix.lower()](path, wanted)
-    except KeyError as err:
-        if path.suffix.lower() not in FORMATS:
-            raise DataError("log", str(path), path.suffix or "no suffix", f"one of {FORMATS}") from err
-        raise DataError("signal", str(path), f"no {err.args[0]}", "a signal that the map names") from err
-    except (pa.ArrowException, OSError, ValueError, TypeError, NotImplementedError, EOFError) as err:
-        reason = str(err).splitlines()[0][:160] if str(err) else type(err).__name__
-        raise DataError("log", str(path), f"unreadable ({reason})", "a complete file") from err
+    data = _read(path, wanted)
     out = {}
     for name in sorted(wanted):
         if name not in data:
-            raise DataError("signal", str(path), f"no {name}", f"one of {sorted(data)[:30]}")
+            known = sorted(list_signals(path))
+            raise DataError("signal", str(path), f"no {name}", f"one of {known[:30]}")
         try:
             out[name] = np.asarray(data[name], float)
         except (TypeError, ValueError) as err:
@@ -42,47 +38,137 @@ def read_log(path: Path, wanted: set[str]) -> dict[str, np.ndarray]:
     return out
 
 
-def _readers():
-    return {".csv": _csv, ".parquet": _parquet, ".mat": _mat, ".npz": _npz}
+def list_signals(path: Path) -> Signals:
+    """All signals of a log that are numbers, single numbers included.
+
+    Raises:
+        DataError: where the file is missing, of another format or unreadable.
+    """
+    out = {}
+    for name, value in _read(path, None).items():
+        try:
+            x = np.asarray(value)
+            if x.dtype.kind in "fiub" and x.ndim <= 2:
+                out[name] = x.astype(float)
+        except (TypeError, ValueError):  # ragged
+            continue
+    return out
 
 
-def _csv(path: Path, wanted: set[str]) -> dict[str, np.ndarray]:
-    with pa.csv.open_csv(path) as reader:
-        names = reader.schema.names
-        keep = [n for n in names if n in wanted]
-        parts: dict[str, list[np.ndarray]] = {n: [] for n in keep}
+def _read(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+    """Signals of a file; None wants them all."""
+    if not path.is_file():
+        raise DataError("log", str(path), "no such file", f"a file of {FORMATS}")
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DataError("log", str(path), path.suffix or "no suffix", f"one of {FORMATS}")
+    try:
+        return reader(path, wanted)
+    except DataError:
+        raise
+    except Exception as err:  # each reader raises types of its own for damaged files
+        reason = str(err).splitlines()[0][:160] if str(err) else type(err).__name__
+        raise DataError("log", str(path), f"unreadable ({reason})", "a complete file") from err
+
+
+def _csv(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        first, second = file.readline(), file.readline()
+    if _numbers(first):
+        return _text(path, wanted)
+    delimiter = max(",;\t", key=first.count)
+    comma = delimiter == ";" and "," in second and "." not in second
+    with pa.csv.open_csv(
+        path,
+        parse_options=pa.csv.ParseOptions(delimiter=delimiter),
+        convert_options=pa.csv.ConvertOptions(decimal_point="," if comma else "."),
+    ) as reader:
+        names = [n.strip() for n in reader.schema.names]
+        keep = [i for i, n in enumerate(names) if wanted is None or n in wanted]
+        parts: dict[str, list[np.ndarray]] = {names[i]: [] for i in keep}
         for batch in reader:
-            for name in keep:
-                parts[name].append(batch.column(name).to_numpy(zero_copy_only=False))
-    return {n: np.concatenate(p) for n, p in parts.items()}
+            for i in keep:
+                parts[names[i]].append(batch.column(i).to_numpy(zero_copy_only=False))
+    return {n: np.concatenate(p) for n, p in parts.items() if p}
 
 
-def _parquet(path: Path, wanted: set[str]) -> dict[str, np.ndarray]:
+def _text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+    """Numbers in rows, by blanks, commas, semicolons or tabs; names in a first line, or none."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        first = file.readline()
+    words = _words(first)
+    delimiter = next((c for c in ",;" if c in first), None)
+    header = not _numbers(first)
+    comments = None if header else ("#", "%")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # NumPy only warns of a file without numbers
+        x = np.loadtxt(path, delimiter=delimiter, skiprows=int(header), ndmin=2, comments=comments)
+    if not header:
+        return {VALUES: x}
+    if len(words) != x.shape[1]:
+        raise ValueError(f"{len(words)} names over {x.shape[1]} columns")
+    return {n: x[:, i] for i, n in enumerate(words)}
+
+
+def _words(line: str) -> list[str]:
+    for c in ",;\t":
+        if c in line:
+            return [w.strip() for w in line.strip().strip("#%").split(c)]
+    return line.strip("#% \n").split()
+
+
+def _numbers(line: str) -> bool:
+    """Whether a line holds numbers alone."""
+    try:
+        return len([float(w) for w in _words(line)]) > 0
+    except ValueError:
+        return False
+
+
+def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     names = pa.parquet.read_schema(path).names
-    table = pa.parquet.read_table(path, columns=[n for n in names if n in wanted], partitioning=None)
+    table = pa.parquet.read_table(path, columns=[n for n in names if wanted is None or n in wanted], partitioning=None)
     return {n: table.column(n).to_numpy() for n in table.column_names}
 
 
-def _npz(path: Path, wanted: set[str]) -> dict[str, np.ndarray]:
+def _npz(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     with np.load(path, allow_pickle=False) as file:
-        return {n: file[n] for n in file.files if n in wanted}
+        return {n: file[n] for n in file.files if wanted is None or n in wanted}
 
 
-def _mat(path: Path, wanted: set[str]) -> dict[str, np.ndarray]:
+def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     import h5py
     import scipy.io
 
+    out: dict[str, Any] = {}
     if h5py.is_hdf5(path):
         with h5py.File(path) as file:
-            return {n: np.asarray(file[n.replace(".", "/")]).T for n in wanted if n.replace(".", "/") in file}
-    data = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
-    out = {}
-    for name in wanted:
-        value = data
-        for key in name.split("."):
-            value = value.get(key) if isinstance(value, dict) else getattr(value, key, None)
-            if value is None:
-                break
-        if value is not None:
+
+            def visit(name: str, item: Any) -> None:
+                dotted = name.replace("/", ".")
+                if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
+                    text = item.attrs.get("MATLAB_class", b"") == b"char"
+                    if not text and not item.attrs.get("MATLAB_empty", 0) and (wanted is None or dotted in wanted):
+                        # MATLAB's first dimension is the file's last.
+                        out[dotted] = np.asarray(item).T
+
+            file.visititems(visit)
+        return out
+
+    def walk(name: str, value: Any, depth: int) -> None:
+        if hasattr(value, "_fieldnames"):
+            for key in value._fieldnames if depth < DEEPEST else []:
+                walk(f"{name}.{key}", getattr(value, key), depth + 1)
+        elif wanted is None or name in wanted:
             out[name] = value
+
+    for name, value in scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False).items():
+        if isinstance(name, str) and not name.startswith("__"):
+            walk(name, value, 0)
     return out
+
+
+READERS: dict[str, Callable[[Path, set[str] | None], dict[str, Any]]] = {
+    ".csv": _csv, ".txt": _text, ".dat": _text, ".tsv": _text, ".parquet": _parquet, ".mat": _mat, ".npz": _npz,
+}  # fmt: skip
+FORMATS = tuple(READERS)
