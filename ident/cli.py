@@ -122,6 +122,8 @@ def experiment(
     hidden = [parse_effect(text, arm) for text in effect or []]
     figures = draw_drives(np.random.default_rng(seed + 1000), arm) if drives == "drawn" else None
     made = plan_from_toml(plan) if plan else _plan(arm, points, realizations, seed, (1.0, 0.5, 0.25))
+    if made.robot.folder != arm.folder:
+        raise DataError("--plan", str(plan), f"a plan for {made.robot.name}", f"one for {arm.name}")
     with _progress(quiet or json_) as (_, share):
         data = run_experiment(made, hidden, seed=seed, drives=figures, name=out.name, progress=share)
     save_dataset(data, out)
@@ -164,6 +166,30 @@ def identify(
     with _progress(quiet or json_) as (say, _):
         result = identify_and_write(data, out, estimator, say)
     _print(result, json_, _parameter_table(result["parameters"]))
+
+
+@app.command()
+def design(
+    robot: str,
+    out: Annotated[Path, typer.Option("--out", help="The plan, for `simgap experiment --plan`.")],
+    points: Annotated[int, typer.Option(min=1, help="Operating points for identification.")] = 15,
+    candidates: Annotated[int, typer.Option(min=1, help="Postures to choose from.")] = 8000,
+    criterion: Annotated[str, typer.Option(help="D, A or E.")] = "D",
+    draws: Annotated[int, typer.Option(min=1, help="Of the parameters from a prior; 1: the nominal ones.")] = 1,
+    level: Annotated[list[float] | None, typer.Option(help="Excitation level; several, largest first.")] = None,
+    realizations: Annotated[int, typer.Option(min=1)] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of candidates and excitation.")] = 0,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Optimal operating points and excitation for the next experiment."""
+    from ident.design_output import write_design
+
+    arm = _robot(robot)
+    options = {"points": points, "candidates": candidates, "criterion": criterion, "draws": draws, "seed": seed}
+    with _progress(quiet or json_) as (say, _):
+        summary, text = write_design(arm, out, tuple(level or (1.0,)), say, realizations=realizations, **options)
+    _print(summary, json_, text)
 
 
 @app.command()
