@@ -311,20 +311,42 @@ def robot_folder(
 @app.command()
 def convert(
     files: list[Path],
-    out: Out,
     robot: Annotated[str, typer.Option(help="A name in robot_assets or a robot folder.")],
-    map_: Annotated[Path, typer.Option("--map", help="Which columns hold what.")],
+    map_: Annotated[Path, typer.Option("--map", help="Which columns hold what; with --guess, the file to write.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Where to write the dataset.")] = None,
+    guess: Annotated[bool, typer.Option("--guess", help="Write a first map to edit, from names, shapes and ranges.")] = False,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Real logs (CSV, Parquet, MATLAB, NPZ) into the dataset format."""
+    """Real logs (CSV, text, Parquet, MATLAB, NPZ) into the dataset format."""
     from ident.convert import convert_logs
     from ident.dataset_io import save_dataset
 
+    if guess:
+        return _guess(files, robot, map_, json_)
+    if out is None:
+        raise DataError("--out", "command line", "no such option", "where to write the dataset, or --guess")
     with _progress(quiet or json_) as (say, _):
         data = convert_logs(files, robot, map_, name=out.name, say=say)
     save_dataset(data, out)
     _print({"dataset": str(out), "segments": len(data.segments)}, json_, f"{len(data.segments)} segments in {out}")
+
+
+def _guess(files: list[Path], robot: str, out: Path, json_: bool) -> None:
+    from ident.convert.guess import guess_map
+
+    if out.exists():
+        raise DataError("--map", str(out), "a file that is there already", "a new file: --guess overwrites no map")
+    guessed = guess_map(files, robot)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(guessed.text, encoding="utf-8")
+    except OSError as err:
+        raise DataError("--map", str(out), str(err.strerror or err), "a file that can be written") from err
+    rows = [f"first map in {out}; check it, above all the lines marked EDIT"]
+    rows += [f"  {channel}: {what}" for channel, what in guessed.found.items()]
+    rows += [f"warning: nothing looks like {channel}: name it in the map" for channel in guessed.missing]
+    _print({"map": str(out), "found": guessed.found, "missing": list(guessed.missing)}, json_, "\n".join(rows))
 
 
 @app.command()

@@ -19,12 +19,13 @@ class Description:
 
     Attributes:
         links: names. limits: movable joint -> lower and upper position, rad or m.
-        child: joint -> the link it carries.
+        child: joint -> the link it carries. kinds: movable joint -> one of ``MOVABLE``.
     """
 
     links: frozenset[str]
     limits: dict[str, tuple[float, float]]
     child: dict[str, str]
+    kinds: dict[str, str]
 
 
 def read_urdf(path: Path) -> Description:
@@ -40,7 +41,7 @@ def read_urdf(path: Path) -> Description:
         double = {n for n in names if names.count(n) > 1}
         if double:
             raise DataError(f"{kind} {min(double)}", str(path), "it twice", "distinct names")
-    limits, child, parent = {}, {}, {}
+    limits, child, parent, kinds = {}, {}, {}, {}
     for name, joint in joints:
         ends = []
         for end in ("parent", "child"):
@@ -54,7 +55,7 @@ def read_urdf(path: Path) -> Description:
         parent[ends[1]], child[name] = ends[0], ends[1]
         _numbers(joint.find("origin"), f"joint {name}", path)
         if joint.get("type") in MOVABLE:
-            limits[name] = _limit(joint, name, path)
+            limits[name], kinds[name] = _limit(joint, name, path), str(joint.get("type"))
             axis = _vector(joint.find("axis"), "xyz", f"axis of joint {name}", path, "1 0 0")
             if not np.any(axis):
                 raise DataError(f"axis of joint {name}", str(path), "a zero vector", "a direction")
@@ -63,7 +64,7 @@ def read_urdf(path: Path) -> Description:
     _one_tree(links, parent, path)
     for element, link in zip(root.findall("link"), links, strict=True):
         _check_inertial(element.find("inertial"), link, path)
-    return Description(frozenset(links), limits, child)
+    return Description(frozenset(links), limits, child, kinds)
 
 
 def _root(path: Path) -> ET.Element:

@@ -9,8 +9,10 @@ import tomllib
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.io
 
 from ident.convert import convert_logs
+from ident.convert.guess import guess_map
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import draft_robot, write_robot
 from robot_assets.robot import load_robot
@@ -244,3 +246,92 @@ def test_a_damaged_log_is_one_clear_error(tmp_path, slide, suffix, content):
     with pytest.raises(DataError) as caught:
         convert_logs([tmp_path / f"log{suffix}"], slide.folder, tmp_path / "map.toml")
     assert "\n" not in str(caught.value)
+
+
+# --- a first map
+
+
+def converted(files, robot, folder):
+    guessed = guess_map(files, robot)
+    assert not guessed.missing, guessed.text
+    (folder / "guessed.toml").write_text(guessed.text)
+    return guessed, convert_logs(files, robot, folder / "guessed.toml")
+
+
+def whole(data, channel):
+    return np.concatenate([getattr(s, channel) for s in data.segments])
+
+
+@pytest.mark.parametrize("angle", [("deg", 180 / np.pi), ("rad", 1.0)])
+@pytest.mark.parametrize("time", [("time_ms", 1e3), ("t", 1.0), ("stamp", 1e9)])
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_guessed_map_brings_a_csv_to_si_units(tmp_path, pair, angle, time, first):
+    t, q, qd, tau = motion()
+    columns = {time[0]: t * time[1]}
+    for j in range(2):
+        columns |= {f"pos_{j + first}": q[:, j] * angle[1], f"vel_{j + first}": qd[:, j] * angle[1]}
+        columns |= {f"pos_ref_{j + first}": q[:, j] * angle[1] + 0.01, f"torque_{j + first}": tau[:, j], f"temp_{j + first}": 30 + q[:, j]}
+    np.savetxt(tmp_path / "log.csv", np.stack(list(columns.values()), axis=1), header=",".join(columns), comments="", delimiter=",", fmt="%.15g")
+    guessed, data = converted([tmp_path / "log.csv"], pair.folder, tmp_path)
+    assert set(guessed.found) == {"time", "tau", "q", "qd", "q_ref", "temp"}
+    assert data.sample_rate == 500.0 and [s.role for s in data.segments] == ["identification", "validation"]
+    for channel, x in {"q": q, "qd": qd, "tau": tau, "q_ref": q + 0.01 / angle[1], "temp": 30 + q}.items():
+        assert np.allclose(whole(data, channel), x, atol=1e-9), channel
+
+
+def test_a_guessed_map_finds_side_sign_and_layout_of_a_mat_file(tmp_path, pair):
+    _, q, qd, tau = motion()
+    ratio = np.array([50.0, 100.0])
+    sign = np.array([1.0, -1.0])
+    rec = {"act_theta_mot": (q * ratio).T, "motor_torque": (sign * tau / ratio).T, "speed_rpm": (qd * ratio * 30 / np.pi).T, "encoder_link": q.T + 1e-4}
+    scipy.io.savemat(tmp_path / "log.mat", {"log": rec, "other": {"fs": 500.0, "kp": [1.0, 2.0]}, "name": "a text"})
+    guessed, data = converted([tmp_path / "log.mat"], pair.folder, tmp_path)
+    assert set(guessed.found) == {"tau", "q", "qd", "q_link"} and data.sample_rate == 500.0
+    assert np.allclose(whole(data, "q"), q) and np.allclose(whole(data, "qd"), qd) and np.allclose(whole(data, "q_link"), q + 1e-4)
+    assert np.allclose(whole(data, "tau"), tau)
+    assert "sign = -1" in guessed.text and "joints 2" in guessed.text
+
+
+def test_a_guessed_map_takes_columns_by_joint_names_and_runs_as_roles(tmp_path, pair):
+    t, q, _, tau = motion()
+    for run in ("b", "a"):
+        names = ["position.two", "position.one", "effort.two", "effort.one"]
+        values = {"stamp": t} | dict(zip(names, [q[:, 1], q[:, 0], tau[:, 1], tau[:, 0]]))
+        np.savez(tmp_path / f"{run}.npz", **values)
+    _, data = converted([tmp_path / "b.npz", tmp_path / "a.npz"], pair.folder, tmp_path)
+    assert [(s.name, s.role) for s in data.segments] == [("b", "identification"), ("a", "validation")]
+    assert np.allclose(data.segments[1].q, q) and np.allclose(data.segments[1].tau, tau)
+
+
+def test_a_guessed_map_joins_files_of_one_value_a_line(tmp_path, pair):
+    t, q, _, tau = motion()
+    for name, x in {"time": t, "positions": q, "torques": tau}.items():
+        np.savetxt(tmp_path / f"run_{name}.txt", x.ravel(), fmt="%.15g")
+    guessed, data = converted(sorted(tmp_path.glob("run_*.txt")), pair.folder, tmp_path)
+    assert "width = 2" in guessed.text
+    assert np.allclose(whole(data, "q"), q) and np.allclose(whole(data, "tau"), tau)
+
+
+def test_what_is_not_found_is_left_to_edit(tmp_path, pair):
+    _, q, _, tau = motion()
+    np.savez(tmp_path / "log.npz", position=q, alpha=tau, beta=tau)
+    run = simgap("convert", tmp_path / "log.npz", "--robot", pair.folder, "--guess", "--map", tmp_path / "map.toml")
+    assert run.returncode == 0 and "nothing looks like tau" in run.stdout, run.stderr
+    text = (tmp_path / "map.toml").read_text()
+    assert "# tau_1" in text and "alpha" in text and "EDIT: Hz" in text
+    args = ("convert", tmp_path / "log.npz", "--robot", pair.folder, "--map", tmp_path / "map.toml")
+    assert "tau_1" in simgap(*args, "--out", tmp_path / "d").stderr
+    for more in ((), ("--guess",)):  # neither without a place for the dataset, nor over an edited map
+        run = simgap(*args, *more)
+        assert run.returncode == 2 and len(run.stderr.splitlines()) == 1
+    assert (tmp_path / "map.toml").read_text() == text
+    np.savez(tmp_path / "short.npz", position=q[:5])
+    with pytest.raises(DataError, match="no signal of"):
+        guess_map([tmp_path / "short.npz"], pair.folder)
+
+
+def test_a_repeated_motion_is_said(tmp_path, pair):
+    _, q, _, tau = motion(N=400)
+    np.savez(tmp_path / "log.npz", time=np.arange(2000) / 500.0, q=np.tile(q, (5, 1)), tau=np.tile(tau, (5, 1)))
+    guessed, _ = converted([tmp_path / "log.npz"], pair.folder, tmp_path)
+    assert "# period = 400" in guessed.text
