@@ -318,7 +318,7 @@ def convert(
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Real logs (CSV, text, Parquet, MATLAB, NPZ) into the dataset format."""
+    """Real logs (CSV, text, Parquet, MATLAB, NPZ, MCAP and rosbag2 with JointState) into the dataset format."""
     from ident.convert import convert_logs
     from ident.dataset_io import save_dataset
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -12,6 +13,7 @@ import pytest
 import scipy.io
 
 from ident.convert import convert_logs
+from ident.convert.bags import JOINT_STATE
 from ident.convert.guess import guess_map
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import draft_robot, write_robot
@@ -335,3 +337,137 @@ def test_a_repeated_motion_is_said(tmp_path, pair):
     np.savez(tmp_path / "log.npz", time=np.arange(2000) / 500.0, q=np.tile(q, (5, 1)), tau=np.tile(tau, (5, 1)))
     guessed, _ = converted([tmp_path / "log.npz"], pair.folder, tmp_path)
     assert "# period = 400" in guessed.text
+
+
+# --- ROS 2 recordings and MATLAB 7.3
+
+
+def write_bag(path, topics):
+    """``topics``: name -> list of (stamp ns, joint names, position, velocity, effort)."""
+    from mcap_ros2.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+        other = writer.register_msgdef("std_msgs/msg/Float64", "float64 data")
+        for topic, rows in topics.items():
+            for stamp, names, position, velocity, effort in rows:
+                header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": ""}
+                message = {"header": header, "name": names, "position": position, "velocity": velocity, "effort": effort}
+                writer.write_message(topic, schema, message, log_time=stamp + 1000, publish_time=stamp)
+                writer.write_message("/load", other, {"data": 1.0}, log_time=stamp, publish_time=stamp)
+        writer.finish()
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """Two joints in an order of their own, and now and then a message of a gripper on the same topic."""
+    t, q, qd, tau = motion()
+    start = 1_700_000_000_123_456_789
+    rows = []
+    for k in range(len(t)):
+        rows.append((start + round(t[k] * 1e9), ["two", "one"], q[k, ::-1].tolist(), qd[k, ::-1].tolist(), tau[k, ::-1].tolist()))
+        if k % 10 == 5:
+            rows.append((start + round(t[k] * 1e9), ["finger"], [0.01], [], []))
+    write_bag(tmp_path / "log.mcap", {"/joint_states": rows})
+    return tmp_path / "log.mcap", rows
+
+
+BAG_MAP = """sample_rate = 500.0
+[time]
+source = "stamp"
+[columns]
+tau_1 = "effort.one"
+tau_2 = "effort.two"
+q_1 = "position.one"
+q_2 = "position.two"
+qd_1 = "velocity.one"
+qd_2 = "velocity.two"
+"""
+
+
+def test_joint_states_of_mcap_and_rosbag2_files(tmp_path, pair, bag):
+    import sqlite3
+
+    from mcap.reader import make_reader
+
+    _, q, qd, tau = motion()
+    with sqlite3.connect(tmp_path / "log.db3") as db, bag[0].open("rb") as file:
+        db.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        db.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        db.execute("INSERT INTO topics VALUES (1, '/joint_states', 'sensor_msgs/msg/JointState', 'cdr')")
+        for _, _, message in make_reader(file).iter_messages(topics=["/joint_states"]):
+            db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (message.log_time, message.data))
+    db.close()
+    (tmp_path / "map.toml").write_text(BAG_MAP)
+    for name in ("log.mcap", "log.db3"):
+        s = convert_logs([tmp_path / name], pair.folder, tmp_path / "map.toml").segments[0]
+        assert len(s.t) == 1000
+        assert np.array_equal(s.q, q) and np.array_equal(s.qd, qd) and np.array_equal(s.tau, tau)
+
+
+def test_a_guessed_map_of_a_bag(tmp_path, pair, bag):
+    _, q, qd, tau = motion()
+    guessed, data = converted([bag[0]], pair.folder, tmp_path)
+    assert 'source = "stamp"' in guessed.text and data.sample_rate == 500.0
+    assert np.allclose(whole(data, "q"), q) and np.allclose(whole(data, "tau"), tau) and np.allclose(whole(data, "qd"), qd)
+
+
+def test_topics_of_two_arms_and_fields_left_empty(tmp_path, pair, bag):
+    rows = bag[1]
+    empty = [(stamp, names, position, velocity, []) for stamp, names, position, velocity, _ in rows]
+    write_bag(tmp_path / "two.mcap", {"/left/joint_states": rows, "/right/joint_states": empty})
+    (tmp_path / "map.toml").write_text(BAG_MAP)
+    with pytest.raises(DataError, match="/left/joint_states:"):
+        convert_logs([tmp_path / "two.mcap"], pair.folder, tmp_path / "map.toml")
+    (tmp_path / "map.toml").write_text(re.sub(r'= "(effort|position|velocity|stamp)', r'= "/left/joint_states:\1', BAG_MAP))
+    s = convert_logs([tmp_path / "two.mcap"], pair.folder, tmp_path / "map.toml").segments[0]
+    assert np.array_equal(s.q, motion()[1])
+    (tmp_path / "map.toml").write_text(re.sub(r'= "(effort|position|velocity|stamp)', r'= "/right/joint_states:\1', BAG_MAP))
+    with pytest.raises(DataError, match=r"no /right/joint_states:effort\.one"):
+        convert_logs([tmp_path / "two.mcap"], pair.folder, tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize("keep", [0, 10, 3000, -200])
+@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
+def test_a_truncated_bag_is_one_clear_error(tmp_path, pair, bag, keep, suffix):
+    (tmp_path / f"cut{suffix}").write_bytes(bag[0].read_bytes()[:keep])
+    (tmp_path / "map.toml").write_text(BAG_MAP)
+    with pytest.raises(DataError) as caught:
+        convert_logs([tmp_path / f"cut{suffix}"], pair.folder, tmp_path / "map.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_bag_without_joint_states_says_so(tmp_path, pair):
+    from mcap_ros2.writer import Writer
+
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef("std_msgs/msg/Float64", "float64 data")
+        writer.write_message("/load", schema, {"data": 1.0}, log_time=0)
+        writer.finish()
+    with pytest.raises(DataError, match="no joint states"):
+        guess_map([tmp_path / "log.mcap"], pair.folder)
+
+
+def test_matlab_7_3_files(tmp_path, pair):
+    import h5py
+
+    _, q, _, tau = motion()
+    with h5py.File(tmp_path / "log.mat", "w", userblock_size=512) as file:
+        # As MATLAB writes them: its (N, n) arrays have the shape (n, N) in the file, texts are codes.
+        file["rec/position"], file["rec/torque"] = q.T, tau.T
+        file["rec/rate"] = np.array([[500.0]])
+        file["rec/robot"] = np.frombuffer("pair".encode("utf-16-le"), np.uint16)[:, None]
+        file["rec/robot"].attrs["MATLAB_class"] = np.bytes_("char")
+        cells = file.create_dataset("#refs#/a", data=np.arange(1000.0))
+        file.create_dataset("cell", data=np.array([[cells.ref]], h5py.ref_dtype), dtype=h5py.ref_dtype)
+    with (tmp_path / "log.mat").open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124, b" ") + b"\x00\x02IM")
+    guessed, data = converted([tmp_path / "log.mat"], pair.folder, tmp_path)
+    assert set(guessed.found) == {"tau", "q"} and data.sample_rate == 500.0
+    assert np.array_equal(whole(data, "q"), q) and np.array_equal(whole(data, "tau"), tau)
+    text = guessed.text.replace("rec.torque", "rec.robot")
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(DataError, match=r"no rec\.robot"):
+        convert_logs([tmp_path / "log.mat"], pair.folder, tmp_path / "map.toml")

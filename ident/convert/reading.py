@@ -168,7 +168,20 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return out
 
 
+def _mcap(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+    from ident.convert.bags import read_mcap
+
+    return read_mcap(path, wanted)
+
+
+def _db3(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+    from ident.convert.bags import read_db3
+
+    return read_db3(path, wanted)
+
+
 READERS: dict[str, Callable[[Path, set[str] | None], dict[str, Any]]] = {
     ".csv": _csv, ".txt": _text, ".dat": _text, ".tsv": _text, ".parquet": _parquet, ".mat": _mat, ".npz": _npz,
+    ".mcap": _mcap, ".db3": _db3,
 }  # fmt: skip
 FORMATS = tuple(READERS)
