@@ -312,7 +312,7 @@ def robot_folder(
 def convert(
     files: list[Path],
     robot: Annotated[str, typer.Option(help="A name in robot_assets or a robot folder.")],
-    map_: Annotated[Path, typer.Option("--map", help="Which columns hold what; with --guess, the file to write.")],
+    map_: Annotated[Path, typer.Option("--map", help="Which columns hold what: a file, or a shipped map by name; with --guess, the file to write.")],
     out: Annotated[Path | None, typer.Option("--out", help="Where to write the dataset.")] = None,
     guess: Annotated[bool, typer.Option("--guess", help="Write a first map to edit, from names, shapes and ranges.")] = False,
     json_: Json = False,

@@ -202,14 +202,16 @@ def _resample(
     if stamps[-1] * rate > LONGEST * len(stamps) or stamps[-1] * rate < len(stamps) / LONGEST:
         found = f"{len(stamps)} samples over {stamps[-1]:.4g} s"
         raise DataError("time", str(path), found, f"about sample_rate = {rate:g} Hz: is the unit of time right?")
-    t = np.arange(int(np.floor(stamps[-1] * rate + 1e-6)) + 1) / rate
+    t = np.arange(int(np.floor(stamps[-1] * rate + JITTER)) + 1) / rate
     if len(t) == len(stamps) and np.all(np.abs(step * rate - 1) < JITTER):
         return channels, t
     keep = np.concatenate([[True], step > 0])
     gaps = int(np.sum(step * rate > 1.5))
+    rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)
+    repeated = int(np.sum(np.all(rows[1:] == rows[:-1], axis=1)))
     say(
-        f"{path.name}: {len(stamps)} stamped samples resampled to {len(t)} at {rate:g} Hz; {gaps} gaps, "
-        f"the longest {step.max() * 1e3:.3g} ms, {int(np.sum(~keep))} stamps twice"
+        f"{path.name}: {len(stamps)} stamped samples resampled to {len(t)} at {rate:g} Hz; {gaps} gaps, the longest "
+        f"{step.max() * 1e3:.3g} ms; {int(np.sum(~keep))} stamps twice, {repeated} samples that repeat the one before"
     )
     return {
         k: np.stack([np.interp(t, stamps[keep], c[keep]) for c in v.T], axis=1) for k, v in channels.items()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from robot_assets.errors import DataError
-from robot_assets.values import choice, number, read_toml, show, subtable, tables, text, whole
+from robot_assets.values import choice, exists, number, read_toml, show, subtable, tables, text, whole
 
 UNITS = {
     "rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "rev": 2 * np.pi, "rad/s": 1.0, "deg/s": np.pi / 180,
@@ -22,6 +22,7 @@ COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
 OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap", "plus"}
 KEYS = {"sample_rate", "input_hold", "time", "files", "columns", "multisine", "roles", "split"}
 ROLES = ("identification", "validation")
+SHIPPED = Path(__file__).parent / "maps"
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class LogMap:
 
 
 def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
-    """Read a map file.
+    """Read a map file, or one of ``SHIPPED`` by its name.
 
     Args:
         ratios: (n,) gear ratios of the robot, for columns with ``side = "motor"``.
@@ -114,8 +115,11 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
     Raises:
         DataError: with the key at fault.
     """
-    where = str(path)
-    data = read_toml(Path(path), "map")
+    file = Path(path)
+    if not exists(file) and exists(SHIPPED / f"{path}.toml") and file.name == str(path):
+        file = SHIPPED / f"{path}.toml"
+    where = str(file)
+    data = read_toml(file, "map")
     stray = set(data) - KEYS
     if stray:
         raise DataError(min(stray), where, "an unknown key", f"one of {sorted(KEYS)}")
