@@ -368,6 +368,20 @@ def sampled_frf(
     return G, np.concatenate([dG, d_timing[..., None]], axis=3)
 
 
+def spring_deflections(
+    structure: Structure, par: Parameters, A_inv: np.ndarray, C: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Deflection of each gear spring (F, n, n) and each elastic hinge (F, n_e, n) per motor position.
+
+    Their transposes are torque per pseudo-torque.
+    """
+    n, driven = structure.n, structure.driven
+    held = -A_inv[:, :, driven] * C[:, None, :]
+    deflection = held[:, driven]
+    deflection[:, np.arange(n), np.arange(n)] += 1.0
+    return deflection @ par.coupling, -held[:, structure.elastic] @ par.coupling
+
+
 def impedance_derivatives(
     structure: Structure, par: Parameters, s: np.ndarray, A_inv: np.ndarray, C: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -379,11 +393,8 @@ def impedance_derivatives(
     Returns:
         left: (F, n, n_theta), right: (F, n_theta, n).
     """
-    n, driven, elastic = structure.n, structure.driven, structure.elastic
-    eye = np.broadcast_to(np.eye(n), (len(s), n, n))
-    # Deflection of each spring per motor position, and torque per pseudo-torque: transposes.
-    deflection = (eye - A_inv[:, driven[:, None], driven] * C[:, None, :]) @ par.coupling
-    hinge = (A_inv[:, elastic[:, None], driven] * C[:, None, :]) @ par.coupling
+    eye = np.broadcast_to(np.eye(structure.n), (len(s), structure.n, structure.n))
+    deflection, hinge = spring_deflections(structure, par, A_inv, C)
     one = s[:, None, None] * np.ones((1, 1, 1))
     right = np.concatenate(
         [

@@ -24,11 +24,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.excitation import LOOP_HZ, TORQUE_SHARE, Excitation, shape_amplitudes
-from ident.graybox import Linearisation, Parameters, Structure, equilibrium, impedance, impedance_derivatives, linearise
+from ident.graybox import Linearisation, Parameters, Structure, equilibrium, impedance, linearise, spring_deflections
 from robot_assets.errors import DataError
 
 LOOP_DAMPING = 0.7  # of the position loop that holds a posture
-CHUNK = 8  # postures at a time: their matrices stay in the cache
+CHUNK = 128  # lines of postures at a time: few enough that memory is not handed back and fetched anew
 
 
 @dataclass(frozen=True)
@@ -101,32 +101,33 @@ def information(
     if not (np.all(given.q_std > 0) and np.all(given.tau_std > 0)):
         raise DataError("q_std, tau_std", structure.robot.name, "a level of zero", "noise above zero")
     out = np.empty((len(lins), *2 * (len(par.to_log()),)))
-    for start in range(0, len(lins), CHUNK):
-        out[start : start + CHUNK] = _chunk(structure, par, lins[start : start + CHUNK], given)
+    step = max(1, CHUNK // len(given.frequency))
+    for start in range(0, len(lins), step):
+        out[start : start + step] = _chunk(structure, par, lins[start : start + step], given)
         if progress is not None:
-            progress(min(1.0, (start + CHUNK) / len(lins)))
+            progress(min(1.0, (start + step) / len(lins)))
     return out
 
 
 def _chunk(structure: Structure, par: Parameters, lins: list[Linearisation], given: Conditions) -> np.ndarray:
-    n, e, F, Q = structure.n, len(structure.elastic), len(given.frequency), len(lins)
+    n, F, Q = structure.n, len(given.frequency), len(lins)
     omega = 2 * np.pi * given.frequency
     s = np.tile(1j * omega, Q)
     M, Kg = (np.repeat(np.stack([getattr(lin, name) for lin in lins]), F, axis=0) for name in ("M", "Kg"))
     Z, A_inv, C = impedance(structure, par, Linearisation(np.empty(0), M, Kg, np.empty(0)), s)
-    left, _ = impedance_derivatives(structure, par, s, A_inv, C)
     # Springs and dampers share their directions, and so do inertia and friction of a motor.
-    L = np.concatenate([left[:, :, :n], left[:, :, 2 * n : 3 * n], left[:, :, 4 * n : 4 * n + e]], axis=2)
+    deflection, hinge = spring_deflections(structure, par, A_inv, C)
+    rows = np.concatenate([deflection, np.broadcast_to(np.eye(n), Z.shape), hinge], axis=1)
     moved = np.stack([par.inertia + np.diag(lin.M)[structure.driven] for lin in lins]).repeat(F, axis=0)
     w = 2 * np.pi * LOOP_HZ
     k = np.arange(n)
     closed = Z.copy()
     closed[:, k, k] += moved * (w**2 + 2 * LOOP_DAMPING * w * s[:, None])
     root = np.tile(0.5 * np.sqrt(n) * given.amplitude, (Q, 1))
-    motion = np.swapaxes(L, 1, 2) @ (np.linalg.inv(closed) * root[:, None, :])
+    motion = rows @ (np.linalg.inv(closed) * root[:, None, :])
     Sigma = (Z * given.q_std**2) @ np.conj(np.swapaxes(Z, 1, 2))
     Sigma[:, k, k] += given.tau_std**2
-    torque = np.conj(np.swapaxes(L, 1, 2)) @ (np.linalg.inv(Sigma) @ L) * given.samples
+    torque = np.conj(rows) @ (np.linalg.inv(Sigma) * given.samples) @ np.swapaxes(rows, 1, 2)
     X = torque * (np.conj(motion) @ np.swapaxes(motion, 1, 2))
     # Powers of s: conj(s)^i s^j = (-j)^i j^j omega^(i + j), summed over lines.
     power, direction, size = _terms(structure, par)
