@@ -20,6 +20,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help="Find what a 
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
 Out = Annotated[Path, typer.Option("--out", help="Where to write.")]
+FRF_ESTIMATORS = "auto, h1, jio, ari, har, log; lpm or lrm for fewer experiments than inputs."
 
 
 def main() -> None:
@@ -141,12 +142,18 @@ def check(dataset: Path, json_: Json = False, quiet: Quiet = False) -> None:
 
 
 @app.command()
-def frf(dataset: Path, out: Out, json_: Json = False, quiet: Quiet = False) -> None:
+def frf(
+    dataset: Path,
+    out: Out,
+    estimator: Annotated[str, typer.Option(help=FRF_ESTIMATORS)] = "auto",
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
     """Nonparametric FRFs, covariances and nonlinear distortion levels."""
     from ident.dataset_io import load_dataset
     from ident.frf_output import write_frf
 
-    summary = write_frf(load_dataset(dataset), out)
+    summary = write_frf(load_dataset(dataset), out, estimator)
     _print(summary, json_, f"FRFs of {len(summary['operating_points'])} operating points in {out}")
 
 
@@ -155,6 +162,7 @@ def identify(
     dataset: Path,
     out: Out,
     estimator: Annotated[str, typer.Option(help="wlls, lls, wnls, nls (FRF), or ml (torque residual).")] = "wlls",
+    frf: Annotated[str, typer.Option("--frf", help=FRF_ESTIMATORS)] = "auto",
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -164,7 +172,7 @@ def identify(
 
     data = load_dataset(dataset)
     with _progress(quiet or json_) as (say, _):
-        result = identify_and_write(data, out, estimator, say)
+        result = identify_and_write(data, out, estimator, say, frf)
     _print(result, json_, _parameter_table(result["parameters"]))
 
 

@@ -21,6 +21,7 @@ from ident.dataset import Dataset, Segment
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("auto", "h1", "jio", "ari", "har", "log")
+LOCAL = ("lpm", "lrm")  # of ``ident.local_frf``
 SMOOTH = 3  # lines on either side over which a covariance of few degrees of freedom is smoothed
 ENOUGH = 8  # degrees of freedom from which a variance is taken as it is
 
@@ -37,7 +38,7 @@ class FRF:
         frequency: (F,) Hz. lines: (F,).
         operating_points: names. q0: (Q, n) rad, mean motor position.
         amplitude: relative level. realizations, periods: averaged; the fewest of all points.
-        estimator: of ``ESTIMATORS``.
+        estimator: of ``ESTIMATORS`` or ``LOCAL``.
     """
 
     G: np.ndarray
@@ -74,25 +75,22 @@ def estimate_frf(
     """Estimate the FRFs of all operating points at one excitation level.
 
     Args:
-        estimator: one of ``ESTIMATORS``; "auto" is JIO where a reference was recorded, else ARI.
+        estimator: one of ``ESTIMATORS``; "auto" is JIO where a reference was recorded, else ARI. Or one
+            of ``LOCAL``, for fewer experiments than inputs.
         amplitude: level; the highest where None.
 
     Raises:
         DataError: where nothing was recorded at that level, a point has fewer than n experiments or
             experiments that do not excite every input, or JIO has no reference.
     """
-    if estimator not in ESTIMATORS:
-        raise DataError("estimator", "estimate_frf", repr(estimator), f"one of {ESTIMATORS}")
-    segments = _periodic(dataset, role)
-    if not segments:
-        raise DataError("multisine segments", dataset.name, f"none of role {role}", "at least n per operating point")
-    level = max(s.amplitude for s in segments) if amplitude is None else amplitude
-    chosen = [s for s in segments if np.isclose(s.amplitude, level)]
-    if not chosen:
-        raise DataError("amplitude", dataset.name, f"{level:g}", f"one of {frf_levels(dataset, role=role)}")
-    points: dict[str, list[Segment]] = {}
-    for s in chosen:
-        points.setdefault(str(s.operating_point), []).append(s)
+    if estimator not in ESTIMATORS + LOCAL:
+        raise DataError("estimator", "estimate_frf", repr(estimator), f"one of {ESTIMATORS + LOCAL}")
+    if estimator in LOCAL:
+        from ident.local_frf import estimate_local
+
+        return estimate_local(dataset, method=estimator, role=role, amplitude=amplitude)
+    points, level = choose_segments(dataset, role, amplitude)
+    chosen = [s for members in points.values() for s in members]
     lines = _common_lines(chosen, dataset)
     frequency = lines * dataset.sample_rate / chosen[0].period
     n = dataset.n
@@ -114,11 +112,32 @@ def estimate_frf(
         lines=lines,
         operating_points=tuple(points),
         q0=np.stack([np.mean([s.periodic("q").mean(axis=(0, 1)) for s in m], axis=0) for m in points.values()]),
-        amplitude=float(level),
+        amplitude=level,
         realizations=min(b.U.shape[0] for b in blocks),
         periods=min(b.U.shape[1] for b in blocks),
         estimator=kind,
     )
+
+
+def choose_segments(
+    dataset: Dataset, role: str, amplitude: float | None = None
+) -> tuple[dict[str, list[Segment]], float]:
+    """Multisine segments of a role at one level, by operating point, and that level; the highest where None.
+
+    Raises:
+        DataError: where there are none.
+    """
+    segments = _periodic(dataset, role)
+    if not segments:
+        raise DataError("multisine segments", dataset.name, f"none of role {role}", "at least n per operating point")
+    level = max(s.amplitude for s in segments) if amplitude is None else amplitude
+    points: dict[str, list[Segment]] = {}
+    for s in segments:
+        if np.isclose(s.amplitude, level):
+            points.setdefault(str(s.operating_point), []).append(s)
+    if not points:
+        raise DataError("amplitude", dataset.name, f"{level:g}", f"one of {frf_levels(dataset, role=role)}")
+    return points, float(level)
 
 
 def average(blocks: Blocks, estimator: str) -> np.ndarray:

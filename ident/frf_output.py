@@ -14,9 +14,13 @@ from ident.frf import estimate_frf
 from ident.outputs import outputs_into
 
 
-def write_frf(dataset: Dataset, out: str | Path) -> dict[str, Any]:
-    """Write ``frf.npz`` and ``frf.json``; returns the summary of the latter."""
-    frf = estimate_frf(dataset)
+def write_frf(dataset: Dataset, out: str | Path, estimator: str = "auto") -> dict[str, Any]:
+    """Write ``frf.npz`` and ``frf.json``; returns the summary of the latter.
+
+    Args:
+        estimator: see ``estimate_frf``.
+    """
+    frf = estimate_frf(dataset, estimator=estimator)
     distortion = estimate_distortion(dataset, frf)
     magnitude = np.maximum(np.abs(frf.G), 1e-300)
     summary = {

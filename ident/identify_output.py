@@ -20,12 +20,13 @@ from robot_assets.errors import DataError
 
 
 def identify_and_write(
-    dataset: Dataset, out: str | Path, estimator: str, progress: Callable[[str], None]
+    dataset: Dataset, out: str | Path, estimator: str, progress: Callable[[str], None], frf_estimator: str = "auto"
 ) -> dict[str, Any]:
     """Fit and write ``parameters.json``.
 
     Args:
         estimator: "nls", "wnls", "lls" or "wlls" on FRFs, or "ml" on the torque residual.
+        frf_estimator: of the FRFs; see ``estimate_frf``.
 
     Raises:
         DataError: for an estimator that there is not, or data without full FRFs.
@@ -38,7 +39,7 @@ def identify_and_write(
         extra = {"chi2_per_dof": result.chi2_per_dof}
     elif estimator in ESTIMATORS:
         progress("frequency responses")
-        frf = estimate_frf(dataset)
+        frf = estimate_frf(dataset, estimator=frf_estimator)
         progress(f"fitting by {estimator}")
         fit = fit_frf(
             build_structure(dataset.robot),
