@@ -14,25 +14,44 @@ import tempfile
 import time
 import traceback
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from ident.dataset import Dataset
+from ident.dataset_io import load_dataset, save_dataset
+from ident.diagnose import diagnose_fully
+from ident.excitation import Plan, make_plan, operating_points
+from robot_assets.robot import load_robot
+from sim import draw_effect, run_experiment
+from sim.effects import EFFECTS, parameters_of
+from sim.experiment import draw_drives
+from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
 
 ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "hardening_stiffness", "payload")
 SIZES = {"smoke": 6, "quick": 26, "full": 120}
 
 
-def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: str) -> dict:
-    """Draw, simulate, write, read, diagnose, compare."""
-    from ident.dataset_io import load_dataset, save_dataset
-    from ident.diagnose import diagnose_fully
-    from ident.excitation import make_plan, operating_points
-    from robot_assets.robot import load_robot
-    from sim import draw_effect, run_experiment
-    from sim.effects import EFFECTS, parameters_of
-    from sim.experiment import draw_drives
-    from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+@dataclass(frozen=True)
+class Case:
+    """A plan, what is hidden in the plant, and the plant's own figures."""
 
+    plan: Plan
+    hidden: list
+    drives: dict[str, np.ndarray]
+    timestep: float
+    seed: int
+
+    def simulate(self) -> Dataset:
+        return run_experiment(self.plan, self.hidden, seed=self.seed, drives=self.drives, timestep=self.timestep)
+
+    def truth(self) -> list[dict]:
+        return [{"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e))} for e in self.hidden]
+
+
+def draw_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: str) -> Case:
+    """Postures, excitation, effects, sizes, drives and the plant's step, all by one seed."""
     rng = np.random.default_rng(seed)
     robot = load_robot(robot_name)
     pool = names or tuple(EFFECTS)
@@ -42,7 +61,7 @@ def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: s
         robot,
         points=2,
         seed=seed,
-        levels=(1.0, 0.4),
+        levels=(1.0, 0.6, 0.3) if rng.random() < 0.5 else (1.0, 0.4),
         postures=postures,
         inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
         gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
@@ -53,11 +72,18 @@ def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: s
     hidden = []
     for i in range(count):
         name = pool[(seed + i * 7) % len(pool)]
-        hidden.append(draw_effect(rng, robot, names=(name,), strength=float(np.exp(rng.uniform(-0.5, 0.7))), peak_torque=peak))
-    truth = [{"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e))} for e in hidden]
+        strength = float(np.exp(rng.uniform(-0.5, 0.7)))
+        hidden.append(draw_effect(rng, robot, names=(name,), strength=strength, peak_torque=peak))
+    return Case(plan, hidden, draw_drives(rng, robot), float(rng.choice([2.5e-4, 2e-4])), seed)
+
+
+def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: str) -> dict:
+    """Draw, simulate, write, read, diagnose, compare."""
+    case = draw_case(seed, names, count, robot_name)
+    truth = case.truth()
     began = time.perf_counter()
     try:
-        data = run_experiment(plan, hidden, seed=seed, drives=draw_drives(rng, robot), timestep=float(rng.choice([2.5e-4, 2e-4])))
+        data = case.simulate()
     except Exception as err:
         return {"seed": seed, "truth": truth, "error": f"{type(err).__name__}: {err}"}
     simulated = time.perf_counter() - began

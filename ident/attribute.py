@@ -26,8 +26,11 @@ DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not wort
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
-FINALISTS = 3  # candidates of a softened round that are fitted to the noise
+FINALISTS = 3  # candidates that are fitted to the end
+FIRST_STEPS = 4  # steps after which candidates are compared for the first time
+HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
+REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
 POLISH_STEPS = 40  # of the winner of a round
 PER_EFFECT = 2  # of one effect, at most
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
@@ -149,12 +152,29 @@ def attribute(
     return Attribution(baseline, detected, p_value, tuple(rounds), current, unknown)
 
 
+def revived(problem: Problem, model: Model) -> Model:
+    """A model whose collapsed dampers and viscous friction are back at a size that a fit can move.
+
+    What a missing cause has driven towards nothing has no slope left in logarithmic coordinates.
+    """
+    par, least = model.par, problem.nominal
+    return replace(
+        model,
+        par=replace(
+            par,
+            damping=np.maximum(par.damping, REVIVED * least.damping),
+            viscous=np.maximum(par.viscous, REVIVED * least.viscous),
+            elastic_damping=np.maximum(par.elastic_damping, REVIVED * least.elastic_damping),
+        ),
+    )
+
+
 def polish(problem: Problem, result: Fit) -> Fit:
     """The winner fitted to the end, under the noise that it sees itself."""
     names = parameter_names(problem.structure.robot)
     return fit(
         problem,
-        result.model,
+        revived(problem, result.model),
         base_names=names,
         iterations=POLISH_STEPS,
         remainders=result.remainders,
@@ -198,10 +218,14 @@ def attribute_once(
         h = score.hypothesis
         if progress is not None:
             progress(f"refit {i + 1}/{len(chosen)}: {h.effect} at {h.place}")
-        model = replace(stage.model, effects=(*stage.model.effects, Effect(h, clip_to_bounds(score))))
-        result = refit(problem, model, stage.weights, stage.remainders)
+        model = replace(stage.model, effects=extended_by(stage.model.effects, score))
+        result = refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
         if result is not None:
             found.append((h, result))
+    found = [
+        (h, result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result)
+        for h, result in hopeful(found)
+    ]
     before = current
     if level > 0:
         sharp = make_weights(problem, preds, 0.0)
@@ -238,11 +262,29 @@ def cost_under(problem: Problem, result: Fit, weights: Weights) -> float:
     return float(sum(np.sum(weights.apply(g, residual(group, pred)) ** 2) for g, (group, pred) in pairs))
 
 
-def refit(problem: Problem, model: Model, weights: Weights, remainders: Sequence[np.ndarray]) -> Fit | None:
+def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:
+    """Candidates that a few steps have not shown to be far behind the best."""
+    ranked = sorted(found, key=lambda x: x[1].cost)
+    limit = HOPELESS_RATIO * max(ranked[0][1].cost - ranked[0][1].count, 0.0) if ranked else 0.0
+    return [
+        (h, r) for i, (h, r) in enumerate(ranked) if i < FINALISTS or (r.cost - r.count < limit and not r.converged)
+    ]
+
+
+def refit(
+    problem: Problem, model: Model, weights: Weights, remainders: Sequence[np.ndarray], iterations: int = 10
+) -> Fit | None:
     """A candidate fitted from where screening put it; None where its model cannot be computed."""
     names = parameter_names(problem.structure.robot)
     try:
-        return fit(problem, model, base_names=names, iterations=10, weights=weights, remainders=remainders)
+        return fit(
+            problem,
+            revived(problem, model),
+            base_names=names,
+            iterations=iterations,
+            weights=weights,
+            remainders=remainders,
+        )
     except (np.linalg.LinAlgError, ValueError, RuntimeError):
         return None
 
@@ -261,11 +303,20 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     return out
 
 
-def clip_to_bounds(score: Score) -> np.ndarray:
+def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:
+    """Effects with the hypothesis of a score, which takes the place of a special case of its own."""
+    h = score.hypothesis
+    special = [e for e in effects if e.hypothesis.key == (h.options.get("absorbs"), h.place)]
+    start = score.start
+    if special:
+        start = h.options["absorb"](start, score.weights, special[0].p)
+    kept = tuple(e for e in effects if not special or e.hypothesis.key != special[0].hypothesis.key)
+    return (*kept, Effect(h, clip_to_bounds(h, start)))
+
+
+def clip_to_bounds(h: Hypothesis, start: np.ndarray) -> np.ndarray:
     """The start of a refit within the bounds of the parameters."""
-    return np.array(
-        [np.clip(v, q.lower, q.upper) for v, q in zip(score.start, score.hypothesis.parameters, strict=True)]
-    )
+    return np.array([np.clip(v, q.lower, q.upper) for v, q in zip(start, h.parameters, strict=True)])
 
 
 def weigh(candidates: Sequence[Candidate], count: int) -> list[Candidate]:

@@ -206,9 +206,9 @@ def make_verdict(
     causes = []
     trust = known_probability(left, result.unknown) if result.detected else 1.0
     covariance = final.covariance()
-    named = [r for r in result.rounds if not r.candidates[0].hypothesis.decoy]
-    for i, effect in enumerate(final.model.effects):
-        candidates = named[i].candidates if i < len(named) else ()
+    competitors = {r.candidates[0].hypothesis.key: r.candidates for r in result.rounds}
+    for effect in final.model.effects:
+        candidates = competitors.get(effect.hypothesis.key, ())
         causes.append(_cause(effect, candidates, final, covariance, trust))
     verdict = "unknown cause remains" if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)

@@ -25,7 +25,6 @@ from ident.inverse import (
 )
 from ident.records import Group
 
-
 LOOP_REFINEMENT = 2  # time grid of a gear's loop, in multiples of that of other laws
 
 
@@ -177,6 +176,7 @@ def _inner_torques(
     S, L, n = solution.Q.shape
     spring = np.zeros((S, L, n), complex)
     link = np.zeros((S, L, structure.n_coordinates), complex)
+    motor = np.zeros((S, L, n), complex)
     spring += solution.torques.spring
     link += solution.torques.link
     motion = Motion(group, solution, par)
@@ -189,8 +189,9 @@ def _inner_torques(
                 h.law(effect.p, _link_view(motion, j, column), j, par.stiffness[j])
             )
         elif h.options.get("kinematic"):
-            X = motion.lines(h.law(effect.p, motion, j, par.stiffness[j]))
-            per_joint[j] = per_joint.get(j, 0.0) + plane.C[:, j] * X
+            error, torque = h.law(effect.p, motion, j, par.stiffness[j])
+            per_joint[j] = per_joint.get(j, 0.0) + plane.C[:, j] * motion.lines(error)
+            motor[..., j] += motion.lines(torque)
     for effect in effects:
         h, j = effect.hypothesis, effect.hypothesis.joint
         if h.channel == "spring" and not h.options.get("kinematic"):
@@ -202,7 +203,7 @@ def _inner_torques(
             link[..., structure.driven[j - 1000]] = value
         else:
             spring[..., j] = value
-    return Torques(spring=spring, link=link)
+    return Torques(spring=spring, link=link, motor=motor)
 
 
 def _spring_loop(

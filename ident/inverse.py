@@ -33,8 +33,9 @@ from ident.graybox import (
 )
 from ident.records import Group
 
-REMAINDER_STEPS = 200  # fixed-point steps at most for the geometric remainder from a cold start
+REMAINDER_STEPS = 60  # fixed-point steps at most for the geometric remainder from a cold start
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
+MEMORY = 6  # past iterates that are mixed
 REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 REACTION_CHANGE = 1e-5  # relative change that ends them
@@ -248,21 +249,41 @@ def solve(
         Q = true_position(group, par, sampling)
     if W is None:
         W = static_remainder(structure, par, plane, group)
-    relaxation, last = 1.0, np.inf
     if react is not None:
         torques = _settle(structure, par, plane, Q, W, torques, react)
+    past: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(steps):
         Q_a = link_motion(structure, par, plane, Q, W, torques)
-        step = geometric_remainder(structure, plane, group, Q_a) - W
-        change = float(np.sqrt(np.sum(np.abs(step) ** 2)))
-        # A large motion near a resonance of the links can overshoot: then smaller steps.
-        relaxation = max(0.5 * relaxation, 0.1) if change > 0.95 * last else relaxation
-        W, last = W + relaxation * step, change
+        change = geometric_remainder(structure, plane, group, Q_a) - W
+        past = [*past[-MEMORY:], (W, change)]
+        W = _accelerated(past)
         if react is not None:
             torques = _settle(structure, par, plane, Q, W, torques, react)
-        if np.abs(step).max() < REMAINDER_CHANGE * np.abs(W).max():
+        if np.abs(change).max() < REMAINDER_CHANGE * np.abs(W).max():
             break
     return _solution(structure, par, plane, Q, W, torques)
+
+
+def _accelerated(past: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Next iterate of the fixed point ``x = x + change(x)``, for every segment by itself.
+
+    Anderson mixing: the combination of past iterates whose changes cancel best. Plain steps
+    overshoot where a large motion meets a resonance of the links (Walker and Ni, SIAM J. Numer.
+    Anal. 49, 2011).
+
+    Args:
+        past: iterates and their changes, (S, L, N) each, the newest last.
+    """
+    x, f = past[-1]
+    if len(past) == 1:
+        return x + f
+    dx = np.stack([x - a for a, _ in past[:-1]])
+    df = np.stack([f - b for _, b in past[:-1]])
+    A = np.einsum("aslj,bslj->sab", df.conj(), df, optimize=True).real
+    b = np.einsum("aslj,slj->sa", df.conj(), f, optimize=True).real
+    ridge = 1e-12 * np.trace(A, axis1=1, axis2=2) + 1e-300
+    share = np.linalg.solve(A + ridge[:, None, None] * np.eye(len(dx)), b[..., None])[..., 0]
+    return x + f - np.einsum("aslj,sa->slj", dx + df, share, optimize=True)
 
 
 def _settle(

@@ -15,7 +15,7 @@ import scipy.fft
 from ident.dataset import Dataset, Segment
 from robot_assets.errors import DataError
 
-RETURN_TIME = 3.0  # s, least time in which a motion is led back to its start: slow against the arm's modes
+RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: what still rings then has decayed
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
@@ -39,7 +39,7 @@ class Group:
         n_time: points of the time grid over one period.
         window: (n_time,) weight of a motion in the time domain, or None for periodic data.
         amplitude: (S,) relative level.
-        start: (S,) s, time of the first sample, for drift over the recording.
+        start: (S,) s, time of the first sample of the middle period, for drift over the recording.
         temperature: (S, n) degC means, or None.
         period_time: s.
         periods: (S,) number of periods averaged.
@@ -162,11 +162,16 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) ->
         n_time=scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True),
         window=None,
         amplitude=np.array([s.amplitude for s in members]),
-        start=np.array([s.t[0] for s in members]),
+        start=np.array([s.t[0] for s in members]) + _middle_periods(members) * N / fs,
         temperature=None if any(x is None for x in temps) else np.stack([x.mean(axis=0) for x in temps]),
         period_time=N / fs,
         periods=np.array([s.steady_periods for s in members]),
     )
+
+
+def _middle_periods(members: list[Segment]) -> np.ndarray:
+    """Periods from the start of a segment to that of the mean of its steady ones."""
+    return np.array([s.transient_periods + 0.5 * (s.steady_periods - 1) for s in members])
 
 
 def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:

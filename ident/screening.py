@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.extended import Prediction
-from ident.hypotheses import Hypothesis, SignalScale
+from ident.hypotheses import Hypothesis, Screen, SignalScale
 from ident.inverse import Motion
 from ident.records import Group
 from ident.torque_fit import Fit, Problem, jacobian, observe_columns, residual
 
+MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
 
 
@@ -79,12 +80,7 @@ def screen(
     """Score every hypothesis, best first."""
     base = _Base.build(problem, fit, predictions)
     joints = problem.structure.n
-    scales = [
-        signal_scale(
-            problem, predictions, j, position_lines(problem, predictions, j)
-        )
-        for j in range(joints)
-    ]
+    scales = [signal_scale(problem, predictions, j, wave_numbers(problem, predictions, j)) for j in range(joints)]
     motions = [pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True)]
     scores = []
     for i, h in enumerate(hypotheses):
@@ -142,7 +138,7 @@ def _score(
         else:
             made = h.screen(motions[g], h.joint, pred.par.stiffness[h.joint], shape)
             start = made.start
-            X = _joint_response(fit, g, group, pred, motions[g], h, made.signals)
+            X = _joint_response(fit, g, group, pred, motions[g], h, made)
         X = X.reshape(-1, X.shape[-1])
         if h.channel in ("motor", "drive"):
             rows, J = X, base.columns[g]
@@ -177,10 +173,10 @@ def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | Non
 
 
 def _joint_response(
-    fit: Fit, g: int, group: Group, pred: Prediction, motion: Motion, h: Hypothesis, signals: Sequence[np.ndarray]
+    fit: Fit, g: int, group: Group, pred: Prediction, motion: Motion, h: Hypothesis, made: Screen
 ) -> np.ndarray:
     """Whitened responses (2, S, K, n, m) of torque signals at one joint, by their channel."""
-    X = np.stack([x if np.iscomplexobj(x) else motion.lines(x) for x in signals], axis=-1)
+    X = np.stack([x if np.iscomplexobj(x) else motion.lines(x) for x in made.signals], axis=-1)
     rec = pred.plane.record[:, None]
     j = h.joint
     if h.channel == "motor":
@@ -193,7 +189,21 @@ def _joint_response(
         gain = rec * pred.plane.Z[:, :, j]
     else:
         gain = np.broadcast_to(np.eye(pred.structure.n, dtype=complex)[j], (len(group.omega), pred.structure.n))
-    return fit.weights.apply(g, observe_columns(group, gain[None, :, :, None] * X[:, :, None, :]))
+    response = gain[None, :, :, None] * X[:, :, None, :]
+    if made.motor:
+        response[:, :, j] += rec[None, :, :] * np.stack([motion.lines(x) for x in made.motor], axis=-1)
+    return fit.weights.apply(g, observe_columns(group, response))
+
+
+def wave_numbers(problem: Problem, predictions: Sequence[Prediction], joint: int) -> tuple[float, ...]:
+    """Candidate periodicities (1/rad) of a joint: those that its residual shows, and motor orders.
+
+    A motion of less than a period does not show its wave number, but parts that turn with the motor
+    repeat a whole number of times in its turn.
+    """
+    ratio = problem.structure.robot.joints[joint].gear_ratio
+    orders = tuple(order * ratio for order in MOTOR_ORDERS) if ratio > 1.0 else ()
+    return (*position_lines(problem, predictions, joint), *orders)
 
 
 def position_lines(

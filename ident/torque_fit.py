@@ -23,6 +23,8 @@ PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural
 PRIOR_TIMING = 0.25  # of the common timing offset, samples
 TIMING_LIMIT = 0.6  # samples
 ANNEALING = (0.5, 0.1, 0.02, 0.0)
+LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
+STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
 GAP = 1e-6  # relative change of the cost that ends a fit
 
 
@@ -288,6 +290,9 @@ def fit(
         Ws = [p.solution.W for p in preds]
         weights = fixed if fixed is not None else make_weights(problem, preds, rho)
         cost = _cost(problem, preds, weights)
+        # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
+        trial_steps = int(any(e.hypothesis.channel == "model" for e in model.effects))
+        moves, drift = _moves_links(model), np.zeros(len(x))
         damping = 1e-3
         converged = False
         for _ in range(iterations):
@@ -301,10 +306,11 @@ def fit(
                 step = np.linalg.solve(H_p + damping * np.diag(size), b_p)
                 step[:m] = np.clip(step[:m], -1.0, 1.0)
                 step[m + 1 :] = _clip_effects(model, step[m + 1 :])
+                step[:m] = np.clip(x[:m] + step[:m], center[:m] - LOG_RANGE, center[:m] + LOG_RANGE) - x[:m]
                 trial = unpack(model, x + step, limit)
                 try:
                     new = [
-                        predict(trial, g, problem.sampling, W=W, steps=0)
+                        predict(trial, g, problem.sampling, W=W, steps=trial_steps)
                         for g, W in zip(problem.groups, Ws, strict=True)
                     ]
                     new_cost = _cost(problem, new, weights)
@@ -319,23 +325,38 @@ def fit(
                 converged = True
                 break
             gain = cost - new_cost
+            drift += np.abs(pack(trial) - x)
             model, x = trial, pack(trial)
             damping = max(damping / 10, 1e-9)
-            preds = [
-                predict(model, g, problem.sampling, W=W, steps=1)
-                for g, W in zip(problem.groups, Ws, strict=True)
-            ]
-            Ws = [p.solution.W for p in preds]
-            cost = _cost(problem, preds, weights)
+            preds, cost = new, new_cost
+            if np.max(np.where(moves, drift, 0.0)) > STALE:
+                preds = [predict(model, g, problem.sampling, W=W, steps=1) for g, W in zip(problem.groups, Ws, strict=True)]
+                Ws = [p.solution.W for p in preds]
+                cost = _cost(problem, preds, weights)
+                drift[:] = 0.0
             if progress is not None:
                 progress(f"fit: stage {stage + 1}/{len(annealing)}, chi2/dof {cost / count:.3g}")
             if gain < max(GAP * cost, 0.02):
                 converged = True
                 break
+    if np.any(drift):
+        preds = [predict(model, g, problem.sampling, W=W, steps=1) for g, W in zip(problem.groups, Ws, strict=True)]
+        Ws = [p.solution.W for p in preds]
+        cost = _cost(problem, preds, weights)
     H, _ = _normal(problem, model, preds, weights)
     return Fit(
         model, cost, count, H, coordinate_names(model, base_names), tuple(Ws), weights, converged
     )
+
+
+def _moves_links(model: Model) -> np.ndarray:
+    """Which fitted coordinates change the motion of the links along given motor motion."""
+    n, n_e = model.structure.n, len(model.structure.elastic)
+    parts = [np.ones(2 * n, bool), np.zeros(2 * n, bool), np.ones(2 * n_e, bool), np.zeros(1, bool)]
+    for effect in model.effects:
+        inside = effect.hypothesis.channel not in ("motor", "drive")
+        parts.append(np.full(len(effect.p), inside))
+    return np.concatenate(parts)
 
 
 def off_sq(off: np.ndarray) -> np.ndarray:

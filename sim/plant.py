@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from robot_assets.errors import DataError
 from robot_assets.robot import Elasticity, Robot
 
+REST_STEPS = 100
 DRIVE_FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
 
@@ -115,13 +116,16 @@ def gravity_torque(plant: Plant, q: np.ndarray) -> np.ndarray:
 def rest(plant: Plant, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """State at rest with the motors at ``q`` (n,): (qpos, holding torque at the motors).
 
-    Newton on the passive and bias forces, by differences: the gears may be nonlinear.
+    Newton on the passive and bias forces, by differences, with a pull back to the last iterate that
+    fades: in the dead band of a gear there is no slope to follow.
     """
     model, data = plant.model, mujoco.MjData(plant.model)
     free = np.concatenate([plant.link, plant.hinges]).astype(int)
     x = np.zeros(model.nq)
     x[plant.motor] = q
     x[plant.link] = q
+    n_e = len(plant.hinges)
+    pull = np.concatenate([plant.drives["stiffness"], np.full(n_e, plant.drives["stiffness"].mean())]) * 1e-2
 
     def force(x: np.ndarray) -> np.ndarray:
         data.qpos[:] = x
@@ -129,15 +133,16 @@ def rest(plant: Plant, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         mujoco.mj_forward(model, data)
         return data.qfrc_passive - data.qfrc_bias
 
-    for _ in range(60):
+    for _ in range(REST_STEPS):
         f = force(x)[free]
         J = np.empty((len(free), len(free)))
         for c, k in enumerate(free):
             moved = x.copy()
             moved[k] += 1e-7
             J[:, c] = (force(moved)[free] - f) / 1e-7
-        step = np.linalg.lstsq(J, -f, rcond=1e-12)[0]
+        step = np.linalg.lstsq(J - np.diag(pull), -f, rcond=1e-14)[0]
         x[free] += np.clip(step, -0.05, 0.05)
+        pull = 0.7 * pull
         if np.abs(step).max() < 1e-12:
             break
     return x, -force(x)[plant.motor]

@@ -43,6 +43,8 @@ def catalogue(chain: Structure) -> tuple[Hypothesis, ...]:
         out += [make(j, name) for make in PER_JOINT]
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.position_friction(j, name))
+        if robot.joints[j].gear_ratio != 1.0:
+            out.append(sensing.encoder_eccentricity(j, name, robot.joints[j].gear_ratio))
     for j in range(len(names) - 1):
         out.append(structure.joint_coupling(j, j + 1, names[j]))
     if robot.payload_link in chain.bodies:

@@ -75,6 +75,10 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
 
         return Screen((s, s * np.exp(-((v / shape[0]) ** 2))), start, shape)
 
+    def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
+        coulomb = max(old[0] + weights[0], 0.1 * old[0])
+        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[2]])
+
     return Hypothesis(
         "stribeck_friction",
         place,
@@ -91,6 +95,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
         screen,
         "The residual torque of {joint} falls from {static:.3g} N m at rest to {coulomb:.3g} N m above"
         " {stribeck_velocity:.2g} rad/s: friction with a Stribeck dip.",
+        options={"absorbs": "coulomb_friction", "absorb": absorb},
     )
 
 
@@ -119,6 +124,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
         "The residual torque of {joint} makes loops in position: friction that yields as a spring of"
         " {stiffness:.3g} N m/rad before it slips at {coulomb:.3g} N m.",
         variable="q",
+        options={"absorbs": "coulomb_friction", "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0]])},
     )
 
 
@@ -148,25 +154,34 @@ def load_dependent_friction(joint: int, place: str) -> Hypothesis:
 
 
 def friction_drift(joint: int, place: str) -> Hypothesis:
-    """Friction that falls by ``relative_change`` with ``time_constant`` as the joint warms up."""
+    """Friction times ``1 + relative_change (1 - exp(-t / time_constant))`` as the joint warms up.
 
-    def unit(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    Viscous and Coulomb friction change alike; ``relative_change`` is negative where they fall.
+    """
+
+    def unit(motion: Motion, j: int, tau: float, smoothing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         v = motion.v(j)
-        warm = 1.0 - np.exp(-motion.time / tau)
-        return v, direction(v), warm
+        return v, direction(v, smoothing), 1.0 - np.exp(-motion.time / tau)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        v, s, warm = unit(motion, j, p[1])
-        return (p[2] * s) * (1.0 - p[0] * warm) - p[3] * p[0] * warm * v
+        v, s, warm = unit(motion, j, p[1], p[4])
+        return p[2] * s * (1.0 + p[0] * warm) + p[3] * p[0] * warm * v
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        v, s, warm = unit(motion, j, shape[0])
+        smoothing = 2e-3 * np.sqrt(np.mean(motion.v(j) ** 2))
+        v, s, warm = unit(motion, j, shape[0], smoothing)
 
         def start(c):
-            viscous = max(abs(c[0]), 1e-6) / 0.3
-            return np.array([0.3 if c[0] < 0 else -0.3, shape[0], max(c[1], 1e-6), viscous])
+            coulomb = max(c[1], 1e-6)
+            change = c[2] / coulomb if c[1] > 1e-6 else 0.3 * np.sign(c[0])
+            change = float(np.clip(change, -0.9, 3.0)) or 0.1
+            return np.array([change, shape[0], coulomb, max(c[0] / change, 1e-6), smoothing])
 
         return Screen((warm * v, s, warm * s), start, shape)
+
+    def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
+        coulomb = max(old[0] + weights[1], 0.1 * old[0])
+        return np.array([np.clip(weights[2] / coulomb, -0.9, 3.0), p[1], coulomb, p[3], old[2]])
 
     return Hypothesis(
         "friction_drift",
@@ -174,10 +189,11 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         joint,
         "motor",
         (
-            Parameter("relative_change", "1", -0.95, 0.95),
+            Parameter("relative_change", "1", -0.98, 5.0, step=1e-3),
             Parameter("time_constant", "s", 1.0, 1e5, log=True, step=1e-2),
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True),
             Parameter("viscous", "N m s/rad", 1e-9, 1e7, log=True, nuisance=True),
+            SMOOTHING,
         ),
         law,
         lambda scale: [(f * scale.duration,) for f in (0.1, 0.3, 1.0)] if scale.duration > 0 else [],
@@ -185,6 +201,7 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
         " of {time_constant:.0f} s.",
         variable="time",
+        options={"absorbs": "coulomb_friction", "absorb": absorb},
     )
 
 

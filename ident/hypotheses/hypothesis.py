@@ -48,11 +48,13 @@ class Screen:
         start: weights -> parameter vector to start a refit from, or None where the weights are
             not physical.
         shape: value of the shape parameters, for keeping the best across operating points.
+        motor: (S, T) torques that act at the motor at the same time, one per signal, or none.
     """
 
     signals: tuple[np.ndarray, ...]
     start: Callable[[np.ndarray], np.ndarray | None]
     shape: tuple[float, ...] = ()
+    motor: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,9 @@ class Hypothesis:
         law: (p, motion, joint, stiffness) -> array as the channel says.
         screen: motion, joint, stiffness, scale -> unit responses.
         sentence: evidence with {joint} and the parameters as fields.
+        options: what single hypotheses need beyond that. ``absorbs`` names an effect that this one
+            holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
+            place of one with parameters ``old`` at the same joint.
     """
 
     effect: str

@@ -56,27 +56,32 @@ def sensor_lag(joint: int, place: str) -> Hypothesis:
     )
 
 
-def encoder_eccentricity(joint: int, place: str) -> Hypothesis:
-    """Measured position holds ``amplitude sin(q + phase)``; the true one is that much less."""
+def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothesis:
+    """Measured position holds ``amplitude sin(turns q + phase)``; the true one is that much less.
+
+    Args:
+        turns: of the encoder in a turn of the joint: the gear ratio where it sits at the motor.
+    """
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        q = motion.q(j)
-        error = p[0] * np.sin(q) + p[1] * np.cos(q)
-        return -motion.lines(error - error.mean(axis=1, keepdims=True))
+        q = turns * motion.q(j)
+        return -motion.lines(p[0] * np.sin(q) + p[1] * np.cos(q))
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        q = motion.q(j)
-        units = []
-        for unit in (np.sin(q), np.cos(q)):
-            units.append(-motion.lines(unit - unit.mean(axis=1, keepdims=True)))
-        return Screen(tuple(units), lambda c: np.array(c))
+        q = turns * motion.q(j)
+        return Screen(
+            (-motion.lines(np.sin(q)), -motion.lines(np.cos(q))), lambda c: np.array(c)
+        )
 
     return Hypothesis(
         "encoder_eccentricity",
         place,
         joint,
         "position",
-        (Parameter("sine", "rad", -0.2, 0.2, step=1e-6), Parameter("cosine", "rad", -0.2, 0.2, step=1e-6)),
+        (
+            Parameter("sine", "rad", -0.2, 0.2, step=1e-6),
+            Parameter("cosine", "rad", -0.2, 0.2, step=1e-6),
+        ),
         law,
         lambda scale: [()],
         screen,

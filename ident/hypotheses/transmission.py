@@ -121,20 +121,30 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
 
 
 def transmission_error(joint: int, place: str) -> Hypothesis:
-    """Gear sees ``q + amplitude sin(periods_per_rev q + phase)`` of the motor."""
+    """Gear sees ``q + amplitude sin(periods_per_rev q + phase)`` of the motor.
 
-    def error(sine: float, n: float, cosine: float, motion: Motion, j: int) -> np.ndarray:
-        q = motion.q(j)
-        return sine * np.sin(n * q) + cosine * np.cos(n * q)
+    A gear without losses passes the torque that it carries back to the motor with the slope of the
+    error, ``tau_s d(error)/dq`` (virtual work); ``reaction`` is 1 then, and fitted because a gear
+    need not be without losses.
+    """
+
+    def parts(p: np.ndarray, motion: Motion, j: int) -> tuple[np.ndarray, np.ndarray]:
+        sine, n, cosine, reaction = p
+        angle = n * motion.q(j)
+        slope = n * (sine * np.cos(angle) - cosine * np.sin(angle))
+        return sine * np.sin(angle) + cosine * np.cos(angle), reaction * slope * motion.tau_s(j)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        q = motion.q(j)
+        n, reaction = shape
         damping = motion.par.damping[j] / motion.par.stiffness[j]
-        signals = []
-        for unit in (np.sin(shape[0] * q), np.cos(shape[0] * q)):
-            X = motion.lines(unit)
-            signals.append(k * (1 + 1j * motion.group.omega * damping) * X)
-        return Screen(tuple(signals), lambda c: np.array([c[0], shape[0], c[1]]), shape)
+        spring = k * (1 + 1j * motion.group.omega * damping)
+        pairs = [parts(np.array([a, n, b, reaction]), motion, j) for a, b in ((1.0, 0.0), (0.0, 1.0))]
+        return Screen(
+            tuple(spring * motion.lines(error) for error, _ in pairs),
+            lambda c: np.array([c[0], n, c[1], reaction]),
+            shape,
+            tuple(torque for _, torque in pairs),
+        )
 
     return Hypothesis(
         "transmission_error",
@@ -145,9 +155,10 @@ def transmission_error(joint: int, place: str) -> Hypothesis:
             Parameter("sine", "rad", -0.1, 0.1, step=1e-7),
             Parameter("periods_per_rev", "1", 0.3, 1e5, step=1e-3),
             Parameter("cosine", "rad", -0.1, 0.1, step=1e-7),
+            Parameter("reaction", "1", -0.5, 1.5, nuisance=True, step=1e-2),
         ),
-        lambda p, motion, j, k: error(*p, motion, j),
-        lambda scale: [(n,) for n in scale.wave_numbers],
+        lambda p, motion, j, k: parts(p, motion, j),
+        lambda scale: [(n, 1.0) for n in scale.wave_numbers],
         screen,
         "The gear of {joint} has a kinematic error of {amplitude:.3g} rad, {periods_per_rev:.4g} periods a turn"
         " of the joint: a ripple that grows near resonance.",
