@@ -1,20 +1,39 @@
-"""What a dataset holds, and what looks wrong in it."""
+"""What a dataset holds, how it was understood, and what looks wrong in it."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from ident.dataset import Dataset
+from ident.channel_checks import (
+    excitation_warnings,
+    linear_joints,
+    lost_sample_warnings,
+    skew_warnings,
+    stuck_warnings,
+    unit_warnings,
+)
+from ident.dataset import Dataset, Segment
 from ident.noise import difference_noise
+
+CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")
+CHECKS = (unit_warnings, stuck_warnings, lost_sample_warnings, skew_warnings, excitation_warnings)
+MOST = 40  # warnings shown
+SHOWN = 12  # segments listed one by one
 
 
 @dataclass(frozen=True)
 class Report:
-    """Contents and warnings of a dataset."""
+    """Contents and warnings of a dataset. One value per joint in SI: rad or m, N m or N, link side.
+
+    Attributes:
+        channels: channel -> joints (from 1) that have it. hold: how torque is taken between samples.
+        q_range, tau_range: (n, 2) smallest and largest value. limits: (n, 2) of the position.
+    """
 
     name: str
     robot: str
@@ -29,19 +48,39 @@ class Report:
     tau_noise: tuple[float, ...]
     motion_rms: tuple[float, ...]
     warnings: tuple[str, ...]
+    hold: str
+    duration: float
+    channels: dict[str, tuple[int, ...]]
+    units: tuple[tuple[str, str], ...]
+    q_range: tuple[tuple[float, float], ...]
+    tau_range: tuple[tuple[float, float], ...]
+    limits: tuple[tuple[float, float], ...]
+    torque_limits: tuple[float, ...]
+    files: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
     def text(self) -> str:
         kinds = ", ".join(f"{v} {k}" for k, v in self.segments.items())
+        n = len(self.joints)
+        hold = "held over a sample" if self.hold == "zoh" else "band-limited or unknown between samples"
         rows = [
-            f"{self.name}: {self.robot}, {len(self.joints)} joints at {self.sample_rate:g} Hz; {kinds}",
-            f"operating points {len(self.operating_points)}, levels {list(self.levels)}, {self.lines} excited lines up to {self.highest_hz:.4g} Hz",
+            f"{self.name}: {self.robot}, {n} joints at {self.sample_rate:g} Hz, {self.duration:.4g} s; {kinds}",
+            f"understood: SI units on the link side of the gear; torque {hold}",
+            "channels: " + ", ".join(c if len(j) == n else f"{c} of joints {', '.join(map(str, j))}" for c, j in self.channels.items()),
         ]
-        for j, name in enumerate(self.joints):
+        if self.operating_points:
             rows.append(
-                f"  {name}: motion {self.motion_rms[j]:.3g} rad rms, noise {self.q_noise[j]:.2g} rad and {self.tau_noise[j]:.2g} N m"
+                f"operating points {len(self.operating_points)}, levels {list(self.levels)}, {self.lines} excited lines up to {self.highest_hz:.4g} Hz"
+            )
+        rows += [f"  {line}" for line in self.files]
+        for j, name in enumerate(self.joints):
+            m, newton = self.units[j]
+            q, tau, limit = self.q_range[j], self.tau_range[j], self.limits[j]
+            rows.append(
+                f"  {name}: q {q[0]:.3g} to {q[1]:.3g} {m} (limits {limit[0]:.3g} to {limit[1]:.3g}), {self.motion_rms[j]:.3g} {m} rms, "
+                f"noise {self.q_noise[j]:.2g} {m}; tau {tau[0]:.3g} to {tau[1]:.3g} {newton} (limit {self.torque_limits[j]:.3g}), noise {self.tau_noise[j]:.2g} {newton}"
             )
         return "\n".join([*rows, *(f"warning: {w}" for w in self.warnings)])
 
@@ -53,9 +92,10 @@ def inspect_dataset(dataset: Dataset) -> Report:
     lines = sorted({int(k) for s in multisines for k in s.excited_lines})
     tops = [max(s.excited_lines) * dataset.sample_rate / s.period for s in multisines if len(s.excited_lines)]
     points = tuple(dict.fromkeys(str(s.operating_point) for s in multisines))
+    robot = dataset.robot
     return Report(
         name=dataset.name,
-        robot=dataset.robot.name,
+        robot=robot.name,
         joints=dataset.joints,
         sample_rate=dataset.sample_rate,
         segments=dict(Counter(f"{s.role} {s.kind}" for s in segments)),
@@ -63,36 +103,68 @@ def inspect_dataset(dataset: Dataset) -> Report:
         levels=tuple(sorted({s.amplitude for s in multisines}, reverse=True)),
         lines=len(lines),
         highest_hz=float(max(tops)) if tops else 0.0,
-        q_noise=_median([difference_noise(s.q) for s in segments]),
-        tau_noise=_median([difference_noise(s.tau) for s in segments]),
+        q_noise=_median([_noise(s.q) for s in segments]),
+        tau_noise=_median([_noise(s.tau) for s in segments]),
         motion_rms=_median([s.q.std(axis=0) for s in segments]),
         warnings=tuple(_warnings(dataset)),
+        hold=dataset.input_hold,
+        duration=sum(s.n_samples for s in segments) / dataset.sample_rate,
+        channels={c: j for c in CHANNELS if (j := _present(segments, c, dataset.n))},
+        units=tuple(("m", "N") if linear else ("rad", "N m") for linear in linear_joints(robot)),
+        q_range=_range([s.q for s in segments]),
+        tau_range=_range([s.tau for s in segments]),
+        limits=tuple((float(a), float(b)) for a, b in zip(robot.q_min, robot.q_max)),
+        torque_limits=tuple(float(x) for x in robot.array("torque_limit")),
+        files=tuple(_line(s, dataset.sample_rate) for s in segments) if len(segments) <= SHOWN else (),
     )
+
+
+def _line(s: Segment, rate: float) -> str:
+    periods = f", {s.periods} periods of {s.period} at {s.operating_point}" if s.kind == "multisine" else ""
+    return f"{s.name}: {s.role} {s.kind}, {s.n_samples / rate:.4g} s{periods}"
+
+
+def _noise(x: np.ndarray) -> np.ndarray:
+    """(n,) noise; zero where there are too few samples to tell."""
+    return difference_noise(x) if len(x) > 4 else np.zeros(x.shape[1])
 
 
 def _median(rows: list[np.ndarray]) -> tuple[float, ...]:
     return tuple(float(v) for v in np.median(rows, axis=0))
 
 
+def _range(signals: list[np.ndarray]) -> tuple[tuple[float, float], ...]:
+    low, high = np.min([x.min(axis=0) for x in signals], axis=0), np.max([x.max(axis=0) for x in signals], axis=0)
+    return tuple((float(a), float(b)) for a, b in zip(low, high))
+
+
+def _present(segments: tuple[Segment, ...], channel: str, n: int) -> tuple[int, ...]:
+    """Joints, from 1, whose channel holds values in every segment."""
+    signals = [getattr(s, channel) for s in segments]
+    if any(x is None for x in signals):
+        return ()
+    return tuple(j + 1 for j in range(n) if all(np.all(np.isfinite(x[:, j])) for x in signals))
+
+
 def _warnings(dataset: Dataset) -> list[str]:
     out = []
-    limits = dataset.robot.array("torque_limit")
     if not any(s.role == "validation" for s in dataset.segments):
         out.append("no validation segments: the gain will be measured by leaving operating points out")
+    if not any(s.role == "identification" for s in dataset.segments):
+        out.append("no identification segments: there is nothing to fit")
+    alike: dict[str, list[str]] = {}
     for s in dataset.segments:
-        for j, name in enumerate(dataset.joints):
-            for channel in ("tau", "q"):
-                x = getattr(s, channel)[:, j]
-                if np.ptp(x) == 0:
-                    out.append(f"{s.name}: {channel}_{j + 1} ({name}) is frozen")
-                elif channel == "tau":
-                    top = np.mean(np.isclose(x, x.max(), rtol=0, atol=1e-9 * np.ptp(x)))
-                    if top > 0.01:
-                        out.append(f"{s.name}: tau_{j + 1} ({name}) is clipped at {x.max():.4g} N m")
-            if np.abs(s.tau[:, j]).max() > 20 * limits[j]:
-                out.append(f"{s.name}: tau_{j + 1} ({name}) is far above the torque limit: wrong unit or side of the gear?")
-            if np.abs(s.q[:, j]).max() > 50:
-                out.append(f"{s.name}: q_{j + 1} ({name}) exceeds 50 rad: degrees, or the motor side of the gear?")
+        found = [w for check in CHECKS for w in check(s, dataset)]
         if s.kind == "multisine" and s.steady_periods < 2:
-            out.append(f"{s.name}: one steady period; noise cannot be told from the scatter between periods")
-    return out[:40]
+            found.append("one steady period; noise cannot be told from the scatter between periods")
+        for w in found:
+            # The same fault in many segments differs in its figures only.
+            alike.setdefault(re.sub(r"(?<![A-Za-z_])-?\d[\d.e+-]*", "#", w) + _joint(w), []).append(f"{s.name}: {w}")
+    for same in alike.values():
+        out.append(same[0] + (f" (so in {len(same)} segments)" if len(same) > 1 else ""))
+    return out[:MOST]
+
+
+def _joint(warning: str) -> str:
+    match = re.match(r"[A-Za-z]\w*", warning)
+    return match[0] if match else ""

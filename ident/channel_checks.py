@@ -1,0 +1,363 @@
+"""What looks wrong in the channels of one recording: units, clipping, freezes, lost samples, skew, poor motion.
+
+Each check is a function of one segment that gives sentences; none changes data. Thresholds are wide:
+a warning is worth reading, silence proves nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+import scipy.signal
+
+from ident.dataset import Dataset, Segment
+from ident.graybox import Structure, build_structure
+from ident.noise import difference_noise
+from robot_assets.robot import Robot
+from robot_assets.urdf import read_urdf
+
+FREEZE = 0.1  # s: a channel that stands still for longer while the joint moves
+CLIPPED = 3e-3  # share of the samples at the very largest value, in runs of three or more
+SMOOTH = 1e-5  # torque noise over torque rms, below which a log was filtered
+LATEST = 0.03  # s: skews are looked for up to here
+ODD = 0.6  # samples: skews of less are common
+SETTLED = 0.3  # s: the filter of the band has forgotten the ends of the log
+BAND = 12.0  # Hz: band in which skew is estimated; rigid bodies and friction explain torque there
+BLOCKS = 8  # stretches of time, of which the jackknife leaves one out
+LONGEST = 2000  # instants that an estimate of skew looks at
+RANK = 1e-6  # of the largest singular value, below which columns tell the same
+EXPLAINED = 0.9  # share of the torque that must be explained for its skew to mean anything
+MOVING = 0.1  # of the largest speed: slower samples are left out, where friction is of another kind
+
+
+@dataclass(frozen=True)
+class Skew:
+    """How late one channel comes after another, s, with its standard deviation; NaN where it cannot be told."""
+
+    late: float
+    std: float
+
+    @property
+    def sure(self) -> bool:
+        return bool(np.isfinite(self.late) and abs(self.late) > 4 * self.std)
+
+
+UNKNOWN = Skew(np.nan, np.nan)
+
+
+def linear_joints(robot: Robot) -> np.ndarray:
+    """(n,) whether a joint is linear."""
+    kinds = read_urdf(robot.urdf).kinds
+    return np.array([kinds[name] == "prismatic" for name in robot.joint_names])
+
+
+def velocity(s: Segment, rate: float) -> np.ndarray:
+    """(N, n) velocity: differences of the position over about 10 ms."""
+    half = max(1, round(0.005 * rate))
+    if len(s.q) <= 2 * half:
+        return np.zeros_like(s.q)
+    v = (s.q[2 * half :] - s.q[: -2 * half]) * rate / (2 * half)
+    return np.concatenate([np.repeat(v[:1], half, axis=0), v, np.repeat(v[-1:], half, axis=0)])
+
+
+def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Values that no such robot can have, and channels that contradict each other."""
+    robot, out = dataset.robot, []
+    kinds, linear = read_urdf(robot.urdf).kinds, linear_joints(robot)
+    v = velocity(s, dataset.sample_rate)
+    limits, speeds = robot.array("torque_limit"), robot.array("velocity_limit")
+    for j, name in enumerate(dataset.joints):
+        m, newton = ("m", "N") if linear[j] else ("rad", "N m")
+        q, tau = s.q[:, j], s.tau[:, j]
+        room = robot.q_max[j] - robot.q_min[j]
+        if kinds[name] != "continuous" and (q.max() > robot.q_max[j] + 0.02 * room or q.min() < robot.q_min[j] - 0.02 * room):
+            why = "wrong unit, zero or side of the gear?" if np.ptp(q) <= 1.1 * room else "degrees, millimetres, or the motor side of the gear?"
+            out.append(f"q_{j + 1} ({name}) goes from {q.min():.4g} to {q.max():.4g} {m}, its limits are {robot.q_min[j]:.4g} and {robot.q_max[j]:.4g}: {why}")
+        fast = float(np.percentile(np.abs(v[:, j]), 99.5))
+        if fast > 2 * speeds[j]:
+            out.append(f"q_{j + 1} ({name}) moves at {fast:.4g} {m}/s, its limit is {speeds[j]:.4g}: wrong unit or sample rate?")
+        top = float(np.abs(tau).max())
+        if top > 3 * limits[j]:
+            out.append(f"tau_{j + 1} ({name}) reaches {top:.4g} {newton}, its limit is {limits[j]:.4g}: wrong unit or side of the gear?")
+        elif 0 < top < 2e-3 * limits[j]:
+            out.append(f"tau_{j + 1} ({name}) stays below {top:.3g} {newton}, its limit is {limits[j]:.4g}: current, or torque before the gear?")
+        for channel, x, reference in (("qd", s.qd, v), ("q_link", s.q_link, s.q), ("q_ref", s.q_ref, s.q)):
+            if x is None or not np.all(np.isfinite(x[:, j])) or np.ptp(x[:, j]) == 0:
+                continue
+            a, b = x[:, j] - x[:, j].mean(), reference[:, j] - reference[:, j].mean()
+            # Only where the two tell the same story can their sizes be compared.
+            gain, alike = _gain(a, b)
+            if alike > 0.9 and not 0.8 < gain < 1.25:
+                what = f"the derivative of q_{j + 1}" if channel == "qd" else f"q_{j + 1}"
+                out.append(f"{channel}_{j + 1} ({name}) is {gain:.4g} times {what}: wrong unit or sign?")
+    return out
+
+
+def _gain(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Slope of a on b, and the size of their correlation."""
+    aa, bb, ab = float(a @ a), float(b @ b), float(a @ b)
+    if aa <= 0 or bb <= 0:
+        return 1.0, 0.0
+    return ab / bb, abs(ab) / np.sqrt(aa * bb)
+
+
+def stuck_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Channels that are constant, freeze in motion, or are cut off at a largest value."""
+    out = []
+    v, linear = velocity(s, dataset.sample_rate), linear_joints(dataset.robot)
+    longest = max(3, round(FREEZE * dataset.sample_rate))
+    for j, name in enumerate(dataset.joints):
+        unit = "N" if linear[j] else "N m"
+        for channel, x in (("tau", s.tau[:, j]), ("q", s.q[:, j])):
+            if np.ptp(x) == 0:
+                out.append(f"{channel}_{j + 1} ({name}) is frozen")
+                continue
+            starts, lengths = _runs(x)
+            k = int(np.argmax(lengths))
+            a, b = int(starts[k]), int(starts[k] + lengths[k])
+            if channel == "tau":
+                moving = np.abs(v[a:b, j]).mean() > 0.05 * np.abs(v[:, j]).max()
+            else:
+                # A position may rest; one that stops within a sample out of full motion did not.
+                before = np.abs(np.diff(x[max(0, a - 4) : a + 1]))
+                after = np.abs(np.diff(x[b - 1 : b + 4]))
+                usual = 0.3 * np.percentile(np.abs(np.diff(x)), 95)
+                moving = len(before) > 0 and len(after) > 0 and min(before.min(), after.max()) > usual
+            inside = a > 0 and b < len(x)
+            if lengths[k] >= longest and moving and inside:
+                out.append(f"{channel}_{j + 1} ({name}) stands still for {lengths[k] / dataset.sample_rate:.3g} s from {s.t[a]:.4g} s on, in motion")
+            for top, word in ((x.max(), "above"), (x.min(), "below")):
+                # Saturation comes in runs; a coarse signal meets its extremes here and there.
+                ends = np.isclose(x[starts], top, rtol=0, atol=1e-9 * np.ptp(x)) & (lengths >= 3)
+                share = float(lengths[ends].sum()) / len(x)
+                if channel == "tau" and share > CLIPPED and len(starts) > 30:
+                    out.append(f"tau_{j + 1} ({name}) is clipped {word} {top:.4g} {unit}, {share:.1%} of the time")
+    return out
+
+
+def _runs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Starts and lengths of the runs of equal values."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0) + 1])
+    return starts, np.diff(np.concatenate([starts, [len(x)]]))
+
+
+def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Samples that repeat the one before in all channels, and positions that take two steps in one."""
+    rows = np.concatenate([s.q, s.tau], axis=1)
+    step = np.diff(s.q, axis=0)
+    noise = np.maximum(difference_noise(s.q), 1e-300) if len(s.q) > 8 else np.full(dataset.n, np.inf)
+    usual = scipy.signal.medfilt(np.abs(step), (9, 1)) if len(step) > 9 else np.abs(step)
+    # Where a joint moves so fast that a lost sample stands out of noise and resolution.
+    resolution = np.array([_resolution(x) for x in step.T])
+    fast = usual > 8 * np.maximum(noise, resolution)
+    moving = np.any(fast, axis=1)
+    repeated = int(np.sum(np.all(rows[1:] == rows[:-1], axis=1) & moving))
+    # A lost sample is lost for all joints; one joint alone may stumble by itself.
+    double = (np.abs(np.abs(step) - 2 * usual) < 0.3 * usual) & fast
+    jumps = int(np.sum(moving & (double.sum(axis=1) > 0.6 * fast.sum(axis=1))))
+    out = []
+    if repeated > max(1, 1e-4 * len(rows)):
+        out.append(f"{repeated} samples ({repeated / len(rows):.1%}) repeat the one before in all channels, in motion: lost packets")
+    if jumps > max(2, 1e-3 * moving.sum()):
+        out.append(f"{jumps} double steps of position between samples: dropped samples")
+    return out
+
+
+def _resolution(step: np.ndarray) -> float:
+    """The smallest step that is no rounding error: of an encoder, its count."""
+    size = np.abs(step[step != 0])
+    if not len(size):
+        return 0.0
+    size = size[size > 1e-9 * size.max()]
+    counts = size / size.min()
+    whole = np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95
+    return float(size.min()) if whole else 0.0
+
+
+def torque_skew(s: Segment, dataset: Dataset) -> Skew:
+    """How late the torques come after the positions, s: the shift at which rigid bodies explain them best.
+
+    All joints together, as one channel of torques is sampled at one time: torque is a linear combination
+    of the rigid-body regressor, of motor inertia and of friction. Samples of slow joints, where friction
+    has memory, are left out. The deviation is that of a jackknife over ``BLOCKS`` stretches of time.
+    It is a cross-correlation in which inertia, gravity and friction have their place.
+    """
+    rate, n = dataset.sample_rate, dataset.n
+    q, tau, v, a = _band(s, rate)
+    every = max(1, int(rate / (5 * BAND)), len(q) // LONGEST)
+    edge = int(rate * SETTLED) + 1
+    pick = np.arange(edge, len(q) - edge, every)
+    if len(pick) < 40 * BLOCKS // 2 or not np.any(np.ptp(v, axis=0) > 0):
+        return UNKNOWN
+    structure = build_structure(dataset.robot)
+    # Friction turns over within a sample, the torque in its band does not: both pass the same filter.
+    turns = _low(np.sign(v), rate)
+    B = _torque_columns(structure, q[pick], v[pick], a[pick], turns[pick])
+    scale = np.maximum(tau.std(axis=0), 1e-300)
+    keep = np.abs(v[pick]) > MOVING * np.maximum(np.abs(v).max(axis=0), 1e-300)
+    size = np.linalg.norm(B.reshape(-1, B.shape[2]), axis=0)
+    B = B[:, :, size > 1e-9 * size.max()] / size[size > 1e-9 * size.max()] / scale[:, None]
+    rows = keep.ravel()
+    block = np.repeat(np.arange(len(pick)) * BLOCKS // len(pick), n)[rows]
+    A = B.reshape(-1, B.shape[2])
+    late, time = 0.0, np.arange(len(tau)) / rate
+    for _ in range(8):
+        y = np.stack([np.interp(time[pick] + late, time, x) for x in tau.T], axis=1) / scale
+        x = np.linalg.lstsq(A[rows], y.ravel()[rows], rcond=RANK)[0]
+        fit = (A @ x).reshape(y.shape)
+        slope = np.gradient(fit, every / rate, axis=0).ravel()[rows]
+        step = _shift(A[rows], slope, y.ravel()[rows])
+        late = late - step
+        if abs(late) > LATEST:
+            return UNKNOWN
+        if abs(step) < 1e-6:
+            break
+    explained = 1 - np.sum((y - fit).ravel()[rows] ** 2) / np.sum((y - y.mean(axis=0)).ravel()[rows] ** 2)
+    if explained < EXPLAINED:
+        return UNKNOWN
+    parts = np.array([_shift(A[rows][block != k], slope[block != k], y.ravel()[rows][block != k]) for k in range(BLOCKS)])
+    return Skew(float(late), float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2))))
+
+
+def _torque_columns(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """(N, n, columns) what joint torques are a linear combination of; ``turns``: direction of motion."""
+    model, data, d = structure.model, structure.model.createData(), structure.driven
+    N, n = q.shape
+    full = np.zeros((3, N, model.nv))
+    for k, x in enumerate((q, v, a)):
+        full[k][:, d] = x
+    rigid = np.array([pin.computeJointTorqueRegressor(model, data, *full[:, i]).reshape(model.nv, -1)[d].copy() for i in range(N)])
+    own = np.zeros((N, n, 5 * n))
+    for j in range(n):
+        own[:, j, 5 * j : 5 * j + 5] = np.stack([a[:, j], v[:, j], v[:, j] * np.abs(v[:, j]), turns[:, j], np.ones(N)], axis=1)
+    return np.concatenate([rigid, own], axis=2)
+
+
+def _shift(A: np.ndarray, slope: np.ndarray, y: np.ndarray) -> float:
+    """Least-squares coefficient of ``slope`` beside the columns ``A``."""
+    U, sv, _ = np.linalg.svd(A, full_matrices=False)
+    U = U[:, sv > RANK * sv[0]]
+    own = slope - U @ (U.T @ slope)
+    return float(own @ (y - U @ (U.T @ y)) / max(own @ own, 1e-300))
+
+
+def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
+    """How late the link encoder of each joint comes after its motor encoder, s.
+
+    ``q - q_link = late q' + (M q'' + c + g) / stiffness + lost motion sign(q') + offset``: the gear carries
+    the link, as the URDF has it, and not the friction of the motor.
+    """
+    out, rate = [], dataset.sample_rate
+    if s.q_link is None:
+        return [UNKNOWN] * dataset.n
+    q, _, v, a = _band(s, rate)
+    structure, edge = build_structure(dataset.robot), int(rate * SETTLED)
+    data, full = structure.model.createData(), np.zeros((3, len(q), structure.model.nv))
+    for k, x in enumerate((q, v, a)):
+        full[k][:, structure.driven] = x
+    carried = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(q))])[:, structure.driven]
+    for j in range(dataset.n):
+        link = None if s.q_link is None else s.q_link[:, j]
+        keep = np.abs(v[:, j]) > MOVING * np.abs(v[:, j]).max()
+        keep[:edge] = keep[len(keep) - edge :] = False
+        if link is None or not np.all(np.isfinite(link)) or np.ptp(link) == 0 or keep.sum() < 10 * BLOCKS:
+            out.append(UNKNOWN)
+            continue
+        y = _low(s.q[:, [j]] - link[:, None], rate)[keep, 0]
+        A = np.stack([carried[:, j], a[:, j], np.sign(v[:, j]), np.ones(len(q))], axis=1)[keep]
+        A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+        slope = v[keep, j]
+        block = np.arange(len(y)) * BLOCKS // len(y)
+        parts = np.array([_shift(A[block != k], slope[block != k], y[block != k]) for k in range(BLOCKS)])
+        out.append(Skew(_shift(A, slope, y), float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2)))))
+    return out
+
+
+def _low(x: np.ndarray, rate: float) -> np.ndarray:
+    cut = min(BAND, 0.2 * rate)
+    return scipy.signal.sosfiltfilt(scipy.signal.butter(3, cut / (rate / 2), output="sos"), x, axis=0)
+
+
+def _band(s: Segment, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Position, torque, velocity and acceleration in the low band, (N, n) each."""
+    q, tau = _low(s.q, rate), _low(s.tau, rate)
+    v = np.gradient(q, 1 / rate, axis=0)
+    return q, tau, v, np.gradient(v, 1 / rate, axis=0)
+
+
+def skew_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Skews that are sure; of motions only, where rigid bodies rule. Half a sample is that of a held torque."""
+    rate = dataset.sample_rate
+    if s.kind != "trajectory" or len(s.t) < 4 * rate * SETTLED + 100:
+        return []
+    named = [("torque", "the positions", torque_skew(s, dataset))]
+    named += [(f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k) for j, k in enumerate(link_skew(s, dataset))]
+    return [
+        f"{what} comes {abs(k.late) * 1e3:.2g} ms {'after' if k.late > 0 else 'before'} {other} (± {k.std * 1e3:.1g} ms): channels sampled at different times?"
+        for what, other, k in named
+        if k.sure and abs(k.late) > ODD / rate
+    ]
+
+
+def excitation_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Motions that tell too little: joints at rest, one direction only, or slower than the gears."""
+    robot, rate, out = dataset.robot, dataset.sample_rate, []
+    if len(s.t) < 64:
+        return [f"{len(s.t)} samples are too few"]
+    tau_rms = np.maximum(s.tau.std(axis=0), 1e-300)
+    smooth = np.flatnonzero((difference_noise(s.tau) < SMOOTH * tau_rms) & (np.ptp(s.tau, axis=0) > 0))
+    if len(smooth):
+        out.append(f"no noise is left on the torque of joints {_list(smooth)}: the log was filtered, deviations will come out too small")
+    if s.kind != "trajectory":
+        return out
+    v = velocity(s, rate)
+    speeds = robot.array("velocity_limit")
+    slow = np.flatnonzero(np.percentile(np.abs(v), 99, axis=0) < 0.01 * speeds)
+    if len(slow):
+        out.append(f"joints {_list(slow)} hardly move (below 1 % of their velocity limit): nothing is learnt of them")
+    turns = np.array([_reversals(v[:, j], 0.05 * np.abs(v[:, j]).max()) for j in range(dataset.n)])
+    few = np.flatnonzero((turns < 1) & ~np.isin(np.arange(dataset.n), slow))
+    if len(few):
+        out.append(f"joints {_list(few)} move in one direction only: their friction cannot be told from gravity and offsets")
+    top, anti = highest_frequency(s, rate), anti_resonance(s, robot)
+    still = np.flatnonzero(top < 0.3 * anti)
+    if len(still):
+        j = int(still[np.argmin(top[still] / anti[still])])
+        out.append(
+            f"the motion of joints {_list(still)} has nothing near their anti-resonance (joint {j + 1}: up to {top[j]:.2g} Hz of about "
+            f"{anti[j]:.2g} Hz): stiffness and damping of the gears will rest on their starting guesses"
+        )
+    return out
+
+
+def highest_frequency(s: Segment, rate: float) -> np.ndarray:
+    """(n,) highest frequency, Hz, at which the position stands ten times above its noise."""
+    n = min(len(s.q), 1 << int(np.log2(len(s.q))), 8192)
+    f, P = scipy.signal.welch(s.q - s.q.mean(axis=0), rate, nperseg=n, axis=0, detrend="linear", window="blackmanharris")
+    floor = 10 * np.maximum(2 * difference_noise(s.q) ** 2 / rate, np.median(P[-max(4, len(f) // 10) :], axis=0))
+    out = []
+    for j in range(P.shape[1]):
+        low = P[:, j] < floor[j]
+        gone = np.flatnonzero(low[:-2] & low[1:-1] & low[2:])
+        out.append(f[gone[0]] if len(gone) else f[-1])
+    return np.array(out)
+
+
+def anti_resonance(s: Segment, robot: Robot) -> np.ndarray:
+    """(n,) frequency, Hz, at which each link swings on its gear of ``robot.toml`` with all motors held."""
+    structure = build_structure(robot)
+    q = np.zeros(structure.model.nq)
+    q[structure.driven] = np.median(s.q, axis=0)
+    M = np.diag(pin.crba(structure.model, structure.model.createData(), q))[structure.driven]
+    return np.sqrt(robot.array("stiffness") / np.maximum(M, 1e-9)) / (2 * np.pi)
+
+
+def _reversals(v: np.ndarray, threshold: float) -> int:
+    signs = np.sign(v[np.abs(v) > threshold])
+    return int(np.sum(np.diff(signs) != 0))
+
+
+def _list(joints: np.ndarray) -> str:
+    return ", ".join(str(int(j) + 1) for j in joints)

@@ -1,0 +1,172 @@
+"""What `simgap check` says of a dataset: contents, and faults put in one at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from ident.channel_checks import link_skew, torque_skew
+from ident.checking import inspect_dataset
+from ident.dataset import Dataset, Segment
+from robot_assets.robot import load_robot
+
+RATE, N = 500.0, 6000
+
+
+def recording(robot, rng, late=0.0, q_link_late=0.0, N=N, rate=RATE):
+    """Torque and link position of rigid bodies, friction and gears, by Pinocchio; channels may come late, s."""
+    model = pin.buildModelFromUrdf(str(robot.urdf))
+    data = model.createData()
+    t = np.arange(N) / rate
+
+    def torque(q, v, a):
+        rigid = np.array([pin.rnea(model, data, *x) for x in zip(q, v, a)])
+        f, J = robot.array("viscous_friction"), robot.array("motor_inertia")
+        return rigid, rigid + J * a + f * v + 0.02 * robot.array("torque_limit") * np.tanh(v / 0.01)
+
+    seed = int(rng.integers(1 << 30))
+    q, v, _ = motion(t, seed, robot)
+    _, tau = torque(*motion(t - late, seed, robot))
+    before = motion(t - q_link_late, seed, robot)
+    q_link = before[0] - torque(*before)[0] / robot.array("stiffness")
+    tau = tau + 1e-3 * robot.array("torque_limit") * rng.normal(size=tau.shape)
+    noise = 3e-6 * rng.normal(size=(2, *q.shape))
+    return Segment("log", "trajectory", "identification", t, tau, q + noise[0], qd=v, q_link=q_link + noise[1])
+
+
+def motion(t, seed, robot):
+    """Position, velocity and acceleration of five harmonics inside the limits, (N, n)."""
+    rng = np.random.default_rng(seed)
+    w = 2 * np.pi * np.arange(1, 6) / 6.0
+    q, v, a = (np.zeros((len(t), robot.n)) for _ in range(3))
+    cos, sin = np.cos(np.outer(t, w)), np.sin(np.outer(t, w))
+    for j in range(robot.n):
+        c, s = rng.normal(size=(2, 5)) / np.arange(1, 6)
+        size = 0.5 / np.sum(np.abs(c) + np.abs(s))
+        c, s = size * c, size * s
+        q[:, j] = cos @ c + sin @ s + 0.5 * (robot.q_min[j] + robot.q_max[j])
+        v[:, j], a[:, j] = cos @ (s * w) - sin @ (c * w), -cos @ (c * w**2) - sin @ (s * w**2)
+    return q, v, a
+
+
+def dataset(robot, *segments):
+    return Dataset("d", robot.name, robot, RATE, robot.joint_names, "none", None, None, None, segments)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return load_robot("ur10_bare")
+
+
+@pytest.fixture(scope="module")
+def log(arm):
+    return recording(arm, np.random.default_rng(1))
+
+
+def warnings(arm, *segments):
+    return inspect_dataset(dataset(arm, *segments)).warnings
+
+
+def test_a_sound_recording_gives_no_warning_but_of_what_it_lacks(arm, log):
+    found = warnings(arm, log, replace(log, name="held", role="validation"))
+    assert all("anti-resonance" in w for w in found), found
+    assert any("2 segments" in w for w in found)
+    report = inspect_dataset(dataset(arm, log))
+    assert "no validation" in report.warnings[0]
+    assert report.channels["q_link"] == (1, 2, 3, 4, 5, 6) and "r" not in report.channels
+    assert report.duration == N / RATE and "shoulder_lift_joint: q" in report.text()
+
+
+def change(x, j, f):
+    x = x.copy()
+    x[:, j] = f(x[:, j])
+    return x
+
+
+def frozen(x):
+    k = int(np.argmax(np.abs(np.gradient(x))[500:-500])) + 500
+    out = x.copy()
+    out[k : k + 100] = out[k]
+    return out
+
+
+FAULTS = {
+    "degrees": (lambda s: replace(s, q=np.rad2deg(s.q), qd=None, q_link=None), "its limit"),
+    "one joint in degrees": (lambda s: replace(s, q=change(s.q, 2, np.rad2deg)), "q_3"),
+    "milliradians": (lambda s: replace(s, q=change(s.q, 2, lambda x: 1e3 * x), qd=None), "q_3 (elbow_joint) goes from"),
+    "torque of the motor side": (lambda s: replace(s, tau=s.tau / 1e4), "before the gear"),
+    "torque in mN m": (lambda s: replace(s, tau=s.tau * 1e3), "tau_1"),
+    "velocity in deg/s": (lambda s: replace(s, qd=np.rad2deg(s.qd)), "qd_1 (shoulder_pan_joint) is 57."),
+    "velocity of the wrong sign": (lambda s: replace(s, qd=change(s.qd, 1, np.negative)), "qd_2"),
+    "link encoder in degrees": (lambda s: replace(s, q_link=change(s.q_link, 0, np.rad2deg)), "q_link_1"),
+    "no torque": (lambda s: replace(s, tau=change(s.tau, 3, np.zeros_like)), "tau_4 (wrist_1_joint) is frozen"),
+    "torque clipped": (lambda s: replace(s, tau=np.clip(s.tau, -140, 140)), "tau_2 (shoulder_lift_joint) is clipped"),
+    "torque frozen": (lambda s: replace(s, tau=change(s.tau, 1, frozen)), "tau_2 (shoulder_lift_joint) stands still for 0.2 s"),
+    "position frozen": (lambda s: replace(s, q=change(s.q, 1, frozen), qd=None, q_link=None), "q_2 (shoulder_lift_joint) stands still for 0.2 s"),
+    "samples lost": (lambda s: without(s), "double steps"),
+    "samples repeated": (lambda s: repeated(s), "repeat the one before"),
+    "one joint at rest": (lambda s: replace(s, q=change(s.q, 5, lambda x: 1e-4 * x), qd=None, q_link=None), "joints 6 hardly move"),
+    "one direction": (lambda s: replace(s, q=change(s.q, 0, lambda x: np.linspace(0, 1, len(x)) + 1e-6 * x), qd=None, q_link=None), "joints 1 move in one direction"),
+    "filtered": (lambda s: replace(s, tau=smooth(s.tau)), "the log was filtered"),
+    "torque late": (lambda s: replace(s, tau=np.roll(s.tau, 6, axis=0)), "torque comes 12 ms after"),
+    "link late": (lambda s: replace(s, q_link=np.roll(s.q_link, 2, axis=0)), "q_link_1 (shoulder_pan_joint) comes 4 ms after"),
+}
+
+
+def without(s):
+    keep = np.ones(len(s.t), bool)
+    keep[np.random.default_rng(3).choice(len(keep), 60, replace=False)] = False
+    return replace(s, t=s.t[: keep.sum()], tau=s.tau[keep], q=s.q[keep], qd=None, q_link=None)
+
+
+def repeated(s):
+    pick = np.arange(len(s.t))
+    twice = np.random.default_rng(3).choice(len(pick) - 1, 60, replace=False) + 1
+    pick[twice] -= 1
+    return replace(s, tau=s.tau[pick], q=s.q[pick], qd=None, q_link=None)
+
+
+def smooth(x):
+    import scipy.signal
+
+    return scipy.signal.sosfiltfilt(scipy.signal.butter(6, 2 / (RATE / 2), output="sos"), x, axis=0)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_found(arm, log, fault):
+    make, expected = FAULTS[fault]
+    found = warnings(arm, make(log))
+    assert any(expected in w for w in found), found
+
+
+@pytest.mark.parametrize("late", [-0.008, 0.0, 0.0035])
+@pytest.mark.parametrize("name", ["ur10_bare", "panda_bare"])
+def test_skews_are_estimated_within_their_deviation(name, late):
+    robot = load_robot(name)
+    s = recording(robot, np.random.default_rng(7), late=late, q_link_late=late)
+    found = torque_skew(s, dataset(robot, s))
+    assert abs(found.late - late) < 4 * found.std + 1e-4 and found.std < 2e-3, found
+    for k in link_skew(s, dataset(robot, s)):
+        assert abs(k.late - late) < 4 * k.std + 2e-4 and k.std < 1e-3, k
+
+
+def test_a_multisine_experiment_gives_no_warning(clean):
+    data, _ = clean
+    found = [w for w in inspect_dataset(data).warnings if "anti-resonance" not in w]
+    assert not found
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("samples", [1, 2, 5, 9, 20, 63, 64, 400, 3000])
+@pytest.mark.parametrize("kind", ["noise", "constant", "huge"])
+def test_short_and_odd_recordings_are_reported_too(arm, samples, kind):
+    rng = np.random.default_rng(0)
+    x = {"noise": rng.normal(size=(samples, 6)), "constant": np.ones((samples, 6)), "huge": 1e12 * rng.normal(size=(samples, 6))}[kind]
+    q_link = np.where(np.arange(6) < 3, x, np.nan)
+    for rate in (1e-2, 1e3, 1e6):
+        s = Segment("log", "trajectory", "identification", np.arange(samples) / rate, x, x, qd=x, q_link=q_link)
+        report = inspect_dataset(replace(dataset(arm, s), sample_rate=rate))
+        assert report.warnings and report.text() and report.to_dict()
