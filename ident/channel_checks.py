@@ -15,7 +15,7 @@ import scipy.signal
 from ident.dataset import Dataset, Segment
 from ident.graybox import Structure, build_structure
 from ident.noise import difference_noise
-from robot_assets.robot import Robot
+from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
 
 FREEZE = 0.1  # s: a channel that stands still for longer while the joint moves
@@ -45,12 +45,6 @@ class Skew:
 
 
 UNKNOWN = Skew(np.nan, np.nan)
-
-
-def linear_joints(robot: Robot) -> np.ndarray:
-    """(n,) whether a joint is linear."""
-    kinds = read_urdf(robot.urdf).kinds
-    return np.array([kinds[name] == "prismatic" for name in robot.joint_names])
 
 
 def velocity(s: Segment, rate: float) -> np.ndarray:

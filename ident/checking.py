@@ -11,7 +11,6 @@ import numpy as np
 
 from ident.channel_checks import (
     excitation_warnings,
-    linear_joints,
     lost_sample_warnings,
     skew_warnings,
     stuck_warnings,
@@ -19,6 +18,7 @@ from ident.channel_checks import (
 )
 from ident.dataset import Dataset, Segment
 from ident.noise import difference_noise
+from robot_assets.robot import linear_joints
 
 CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")
 CHECKS = (unit_warnings, stuck_warnings, lost_sample_warnings, skew_warnings, excitation_warnings)

@@ -36,6 +36,7 @@ DRAG = 0.1  # of the torque limit, taken by viscous friction at the velocity lim
 NOISE = 1e-4  # torque noise over the torque limit
 ENCODER = {False: 3e-6, True: 1e-6}  # position noise, rad or (True: prismatic) m
 VELOCITY = {False: np.pi, True: 1.0}  # velocity limit where the URDF has none, rad/s or m/s
+Carrier = tuple[int, np.ndarray, np.ndarray, bool]  # joint, axis, a point of the axis, linear
 LINEAR_UNITS = {"rad": "m", "N m": "N", "kg m2": "kg"}
 
 
@@ -234,16 +235,16 @@ def _seen(
     rng = np.random.default_rng(0)
     low, high = np.array([np.clip(tree.limits[name], -np.pi, np.pi) for name in names]).T
     joints = root.findall("joint")
-    bodies = {e.get("name"): _body(e) for e in root.findall("link")}
+    bodies = {e.get("name", ""): _body(e) for e in root.findall("link")}
     children: dict[str, list[ET.Element]] = {}
     for joint in joints:
-        children.setdefault(joint.find("parent").get("link"), []).append(joint)
-    (base,) = set(bodies) - set(tree.child.values()) - {j.find("child").get("link") for j in joints}
+        children.setdefault(_link(joint, "parent"), []).append(joint)
+    (base,) = set(bodies) - {_link(j, "child") for j in joints}
     inertia, weight = np.zeros((POSTURES, len(names))), np.zeros((POSTURES, len(names)))
     for p in range(POSTURES):
         q = dict(zip(names, rng.uniform(low, high), strict=True)) | locked
         # Depth first, without recursion: a chain may be longer than Python's stack.
-        stack = [(base, Rotation.identity(), np.zeros(3), ())]
+        stack: list[tuple[str, Rotation, np.ndarray, tuple[Carrier, ...]]] = [(base, Rotation.identity(), np.zeros(3), ())]
         while stack:
             link, R, x, above = stack.pop()
             mass, com, tensor = bodies[link]
@@ -259,18 +260,18 @@ def _seen(
             for joint in children.get(link, []):
                 R_origin, x_origin = _origin(joint)
                 R_joint, x_joint = R * R_origin, x + R.apply(x_origin)
-                name, linear, carried = joint.get("name"), joint.get("type") == "prismatic", above
+                name, slides, carried = joint.get("name", ""), joint.get("type") == "prismatic", above
                 if joint.get("type") != "fixed":
                     own = _three(joint.find("axis"), "xyz", "1 0 0")
                     own = own / np.linalg.norm(own)
                     axis = R_joint.apply(own)
                     if name in names:
-                        carried = (*above, (names.index(name), axis, x_joint, linear))
-                    if linear:
+                        carried = (*above, (names.index(name), axis, x_joint, slides))
+                    if slides:
                         x_joint = x_joint + axis * q[name]
                     else:
                         R_joint = R_joint * Rotation.from_rotvec(own * q[name])
-                stack.append((joint.find("child").get("link"), R_joint, x_joint, carried))
+                stack.append((_link(joint, "child"), R_joint, x_joint, carried))
     weight = np.abs(weight)
     return inertia, np.where(weight < 1e-9 * max(weight.max(), 1e-300), 0.0, weight)
 
@@ -281,13 +282,15 @@ def _body(link: ET.Element) -> tuple[float, np.ndarray, np.ndarray]:
     if inertial is None:
         return 0.0, np.zeros(3), np.zeros((3, 3))
     R, com = _origin(inertial)
-    I = inertial.find("inertia")
+    mass, I = inertial.find("mass"), inertial.find("inertia")
+    assert mass is not None and I is not None  # as read_urdf has checked
     xx, xy, xz, yy, yz, zz = (float(I.get(k, "0")) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return float(inertial.find("mass").get("value")), com, R.as_matrix() @ tensor @ R.as_matrix().T
+    return float(mass.get("value", "0")), com, R.as_matrix() @ tensor @ R.as_matrix().T
 
 
 def _origin(element: ET.Element) -> tuple[Rotation, np.ndarray]:
+    """Rotation and shift (3,) of a joint or an inertial."""
     origin = element.find("origin")
     return Rotation.from_euler("xyz", _three(origin, "rpy", "0 0 0")), _three(origin, "xyz", "0 0 0")
 
@@ -296,8 +299,14 @@ def _three(element: ET.Element | None, key: str, default: str) -> np.ndarray:
     return np.array([float(v) for v in (default if element is None else element.get(key, default)).split()])
 
 
+def _link(joint: ET.Element, end: str) -> str:
+    """The link at the "parent" or "child" end of a joint."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
 def _depth(elements: dict[str, ET.Element], link: str) -> int:
-    parent = {e.find("child").get("link"): e.find("parent").get("link") for e in elements.values()}
+    parent = {_link(e, "child"): _link(e, "parent") for e in elements.values()}
     steps = 0
     while link in parent:
         link, steps = parent[link], steps + 1
@@ -322,5 +331,5 @@ def _quoted(text: str) -> str:
 
 
 def _figure(value: float) -> str:
-    text = f"{value:.3g}"
+    text: str = f"{value:.3g}"
     return text if any(c in text for c in ".e") else f"{text}.0"

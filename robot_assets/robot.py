@@ -28,6 +28,8 @@ class Joint:
         gear_ratio: motor turns per joint turn.
         motor_inertia: kg m2. stiffness: N m/rad. damping, viscous_friction: N m s/rad.
         torque_limit: N m. velocity_limit: rad/s. q_std: encoder noise, rad. tau_std: N m.
+
+    A linear joint has kg, N and m in the place of kg m2, N m and rad.
     """
 
     name: str
@@ -147,6 +149,12 @@ def moving_links(robot: Robot) -> list[str]:
     """Links that a driven joint carries directly: one per joint."""
     child = read_urdf(robot.urdf).child
     return [child[name] for name in robot.joint_names]
+
+
+def linear_joints(robot: Robot) -> np.ndarray:
+    """(n,) whether a joint is linear: its figures are in kg, N and m for kg m2, N m and rad."""
+    kinds = read_urdf(robot.urdf).kinds
+    return np.array([kinds[name] == "prismatic" for name in robot.joint_names])
 
 
 def _folder(name_or_path: str | Path, relative_to: Path | None) -> Path:

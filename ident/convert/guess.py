@@ -1,8 +1,6 @@
 """A first map of a log, guessed from names, shapes and ranges, for a person to edit.
 
-Names say what a signal may be; the robot's limits and the motion itself say in which unit and on
-which side of the gear: a position must fit between the limits, a velocity must be the derivative
-of the position, and friction must take energy out.
+Names say what a signal may be; ``guess_units`` says in which unit and on which side of the gear.
 """
 
 from __future__ import annotations
@@ -15,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import tomlkit
 
+from ident.convert.guess_units import NAMED_UNITS, Family, Scale, guess_scales, range_text
 from ident.convert.mapping import UNITS
 from ident.convert.reading import VALUES, list_signals
 from robot_assets.errors import DataError
-from robot_assets.robot import Robot, load_robot
-from robot_assets.urdf import read_urdf
+from robot_assets.robot import Robot, linear_joints, load_robot
 
 SHORTEST = 20  # samples; anything shorter is no signal but a setting
 RATES = (20.0, 50e3)  # Hz: a log of an arm is sampled between
@@ -42,41 +40,6 @@ ACTUAL = ("act", "actual", "meas", "measured", "ist", "rec", "state", "states", 
 DERIVED = ("err", "error", "ff", "feedforward", "acc", "acceleration", "ddq", "qdd", "model", "est", "sim", "init", "limit", "residual", "std")
 TIMES = ("t", "time", "times", "stamp", "timestamp", "zeit", "secs", "sec")
 SETTINGS = {"fs": 1, "rate": 1, "sample_rate": 1, "frequency": 1, "dt": -1, "ts": -1, "sample_time": -1, "tsample": -1}
-NAMED_UNITS = {
-    "deg": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "rad": "rad", "radians": "rad", "mrad": "mrad", "rpm": "rpm", "mm": "mm",
-    "nm": "N m", "mnm": "mN m", "knm": "kN m", "ma": "mA", "amp": "A", "amps": "A", "volt": "V", "voltage": "V",
-    "ns": "ns", "us": "us", "usec": "us", "ms": "ms", "msec": "ms", "s": "s", "sec": "s",
-}  # fmt: skip
-CURRENTS = ("current", "currents", "curr", "cur", "strom", "iq")
-
-
-@dataclass(frozen=True)
-class Family:
-    """One quantity of all joints.
-
-    Attributes:
-        words: lower-case parts of its names.
-        sources: (n,) signal of each joint and its column, None for a signal of one column.
-        x: (N, n) values as they stand in the log.
-    """
-
-    name: str
-    words: tuple[str, ...]
-    sources: tuple[tuple[str, int | None], ...]
-    x: np.ndarray
-
-    def has(self, vocabulary: Sequence[str]) -> bool:
-        return any(w in vocabulary or any(len(v) > 2 and w.startswith(v) for v in vocabulary) for w in self.words)
-
-
-@dataclass(frozen=True)
-class Scale:
-    """How a family becomes SI: ``factor`` (n,) and the options of the map that say so; ``signs`` (n,) of torques."""
-
-    factor: np.ndarray
-    options: tuple[str, ...]
-    note: str
-    signs: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -114,8 +77,8 @@ def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
     families = _families({k: x for k, x in signals.items() if _length(x) == N}, arm)
     time, rate, time_unit = _time(families, signals, N, arm.n)
     chosen, others = _choose([f for f in families if f.x.shape[1] == arm.n and f is not time], arm)
-    linear = _linear(arm)
-    scales = _scales(chosen, arm, linear, rate)
+    linear = linear_joints(arm)
+    scales = guess_scales(chosen, arm, linear, rate)
     text = _render(paths, arm, parts, time, time_unit, rate, chosen, others, scales, families, linear)
     found = {c: f"{chosen[c].name}{', ' + ', '.join(s.options) if (s := scales[c]).options else ''}" for c in chosen}
     if time is not None:
@@ -285,163 +248,6 @@ def _round_rate(rate: float, within: float) -> float:
     return float(f"{rate:.6g}")
 
 
-# --- units, sides and signs
-
-
-def _linear(arm: Robot) -> np.ndarray:
-    """(n,) whether a joint is linear."""
-    kinds = read_urdf(arm.urdf).kinds
-    return np.array([kinds[name] == "prismatic" for name in arm.joint_names])
-
-
-def _scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate: float | None) -> dict[str, Scale]:
-    out: dict[str, Scale] = {}
-    velocity = None
-    # A drive that reports torque before the gear mostly reports its position there too.
-    before = "tau" in chosen and _before_gear(chosen["tau"].x * UNITS[_torque_unit(chosen["tau"], linear)], arm)
-    for channel in ("q", "q_ref", "q_link"):
-        if channel in chosen:
-            out[channel] = _position(chosen[channel], arm, linear, rate, before and channel != "q_link")
-    if "q" in chosen:
-        velocity = np.gradient(chosen["q"].x * out["q"].factor, 1.0 / (rate or 1000.0), axis=0)
-    if "qd" in chosen:
-        out["qd"] = _velocity(chosen["qd"], velocity, arm, linear)
-    if "tau" in chosen:
-        out["tau"] = _torque(chosen["tau"], chosen.get("q"), out.get("q"), arm, linear, rate or 1000.0)
-    if "temp" in chosen:
-        out["temp"] = Scale(np.ones(arm.n), ('unit = "degC"',), "")
-    return out
-
-
-def _before_gear(torque: np.ndarray, arm: Robot) -> bool:
-    """Whether torques (N, n) are of the size that a motor has before its gear.
-
-    Between three hundredths of the limit and a little more than it is where torques of a log lie.
-    """
-    ratio, share = np.abs(arm.array("gear_ratio")), np.abs(torque).max(axis=0) / arm.array("torque_limit")
-    return bool(np.any(ratio > 3) and np.median(share) < 0.1 and 0.03 < np.median(share * ratio) < 3.0)
-
-
-def _unit_of(family: Family, allowed: Sequence[str]) -> str | None:
-    return next((NAMED_UNITS[w] for w in family.words if NAMED_UNITS.get(w) in allowed), None)
-
-
-def _position(family: Family, arm: Robot, linear: np.ndarray, rate: float | None, before: bool) -> Scale:
-    """The first unit and side with which the motion fits the limits of place and speed."""
-    meter = "m" if np.all(linear) else "rad"
-    if np.all(linear):
-        named, choices = _unit_of(family, ("mm",)), [("m", "link"), ("mm", "link"), ("um", "link")]
-    else:
-        named = _unit_of(family, ("deg", "rad", "mrad"))
-        choices = [("rad", "link"), ("deg", "link"), ("rad", "motor"), ("deg", "motor"), ("rev", "motor")]
-        if before:
-            choices[1], choices[2] = choices[2], choices[1]
-    if named:
-        choices = [c for c in choices if c[0] == named] or [(named, "link")]
-    room = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
-    travel = np.ptp(family.x, axis=0)
-    speed = np.percentile(np.abs(np.diff(family.x, axis=0)), 99, axis=0) * (rate or 0.0)
-    fitting = []
-    for unit, side in choices:
-        factor = UNITS[unit] / (arm.array("gear_ratio") if side == "motor" else np.ones(arm.n))
-        size = np.abs(factor)
-        fits = (travel * size <= 2.2 * room) & (speed * size <= 2.0 * arm.array("velocity_limit"))
-        fits &= np.abs(family.x * size).max(axis=0) <= 2 * room + np.pi * ~linear
-        if np.all(fits):
-            fitting.append((unit, side, factor))
-    if not fitting:
-        unit, side = choices[0]
-        note = f"EDIT: no unit fits the limits of the joints; as it stands {_range(family.x)}"
-        return Scale(np.full(arm.n, UNITS[unit]), _options(unit, side), note)
-    unit, side, factor = fitting[0]
-    note = f"{unit} by the {'name' if named else 'range'}; {_range(family.x * factor)} {meter}"
-    # Small units always fit; only a neighbour of nearly the same size is a doubt.
-    rival = next((c for c in fitting[1:] if np.median(np.abs(factor / c[2])) < 4.0), None)
-    if rival is not None:
-        note += f"; EDIT? {rival[0]} on the {rival[1]} side fits as well"
-    return Scale(factor, _options(unit, side), note)
-
-
-def _velocity(family: Family, velocity: np.ndarray | None, arm: Robot, linear: np.ndarray) -> Scale:
-    """The unit, side and sign that make it the derivative of the position."""
-    choices = ("m/s", "mm/s") if np.all(linear) else ("rad/s", "deg/s", "rpm")
-    if velocity is not None:
-        slope = np.sum(velocity * family.x, axis=0) / np.maximum(np.sum(family.x**2, axis=0), 1e-300)
-        moving = np.std(velocity, axis=0) > 1e-9
-        for unit in choices:
-            for side in ("link", "motor"):
-                for sign in (1, -1):
-                    factor = sign * UNITS[unit] / (arm.array("gear_ratio") if side == "motor" else np.ones(arm.n))
-                    if np.any(moving) and np.all(np.abs(slope / factor - 1)[moving] < 0.15):
-                        return Scale(factor, _options(unit, side, sign), "the derivative of q says so")
-    return Scale(np.ones(arm.n), _options(choices[0], "link"), "EDIT: this is not the derivative of q in any usual unit")
-
-
-def _torque_unit(family: Family, linear: np.ndarray) -> str:
-    unit = _unit_of(family, ("N m", "mN m", "kN m", "A", "mA", "V"))
-    return unit or ("A" if family.has(CURRENTS) else "N" if np.all(linear) else "N m")
-
-
-def _torque(family: Family, position: Family | None, scale: Scale | None, arm: Robot, linear: np.ndarray, rate: float) -> Scale:
-    unit, side = _torque_unit(family, linear), "link"
-    factor = np.full(arm.n, UNITS[unit])
-    share = float(np.median(np.abs(family.x * factor).max(axis=0) / arm.array("torque_limit")))
-    options, notes = [], [_range(family.x)]
-    if unit in ("A", "mA", "V"):
-        options.append("torque_constant = 1.0")
-        notes.append(f"EDIT: the torque constant, or the unit if this is a {'force' if np.all(linear) else 'torque'} after all")
-    if _before_gear(family.x * factor, arm):
-        side, factor = "motor", factor * arm.array("gear_ratio")
-        notes.append(f"{share:.2g} of the torque limit: before the gear by its size")
-    elif share > 3.0:
-        notes.append(f"EDIT: {share:.3g} times the torque limit")
-    elif share < 0.03:
-        notes.append(f"EDIT? only {share:.2g} of the torque limit: is the unit right?")
-    signs = np.ones(arm.n)
-    if position is not None and scale is not None:
-        signs = _friction_sign(position.x * scale.factor, family.x * factor, rate)
-    options = [*_options(unit, side), *options]
-    if np.any(signs < 0):
-        options.append("sign = -1")
-        notes.append("sign by friction, which must brake: joints " + ", ".join(str(j + 1) for j in np.flatnonzero(signs < 0)))
-    return Scale(factor * signs, tuple(options), "; ".join(notes), signs)
-
-
-def _friction_sign(q: np.ndarray, tau: np.ndarray, rate: float) -> np.ndarray:
-    """(n,) -1 where friction would feed energy in: the sign of a torque is then wrong."""
-    out = np.ones(q.shape[1])
-    step = max(1, len(q) // 20000)
-    for j in range(q.shape[1]):
-        v = np.gradient(q[:, j], 1 / rate)
-        if np.std(v) < 1e-9:
-            continue
-        a = np.gradient(v, 1 / rate)
-        slow = 0.1 * np.abs(v).max() + 1e-12
-        columns = [np.tanh(v / slow), a, np.ones_like(v), q[:, j], np.sin(q[:, j]), np.cos(q[:, j])]
-        A = np.stack(columns, axis=1)[::step]
-        A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-        y = tau[::step, j]
-        x, *_ = np.linalg.lstsq(A, y, rcond=1e-9)
-        # Friction as a share of what the other columns leave: too small a share decides nothing.
-        rest = y - A[:, 1:] @ x[1:]
-        if x[0] < 0 and np.linalg.norm(x[0] * A[:, 0]) > 0.5 * np.linalg.norm(rest):
-            out[j] = -1.0
-    return out
-
-
-def _options(unit: str, side: str, sign: int = 1) -> tuple[str, ...]:
-    out = [f'unit = "{unit}"']
-    if side == "motor":
-        out.append('side = "motor"')
-    if sign < 0:
-        out.append("sign = -1")
-    return tuple(out)
-
-
-def _range(x: np.ndarray) -> str:
-    return f"{x.min():.3g} to {x.max():.3g}"
-
-
 # --- the file
 
 
@@ -505,7 +311,7 @@ def _render(
         ]  # fmt: skip
     unused = [f for f in families if f is not time and f.name not in {c.name for c in chosen.values()}]
     if unused:
-        lines += ["", "# Not used:"] + [f"#   {_plain(f.name)}: {_range(f.x)}" for f in unused[:60]]
+        lines += ["", "# Not used:"] + [f"#   {_plain(f.name)}: {range_text(f.x)}" for f in unused[:60]]
     return "\n".join(lines) + "\n"
 
 
