@@ -116,8 +116,11 @@ def write_robot(
     draft = draft_robot(source, lock)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise DataError("--out", str(out), "something there already", "a new or empty folder")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as err:
+        raise DataError("--out", str(out), str(err.strerror or err), "a folder that can be made") from err
     try:
         shutil.copyfile(source, beside / source.name)
         (beside / "robot.toml").write_text(render(draft, target.name, source.name), encoding="utf-8")
@@ -222,6 +225,8 @@ def _locked(path: Path, tree: Description, elements: dict[str, ET.Element], lock
     for name in lock:
         if name not in tree.limits:
             raise DataError("--lock", str(path), name, f"a movable joint: {sorted(tree.limits)}")
+        if lock[name] is not None and not abs(lock[name]) < 1e6:
+            raise DataError("--lock", str(path), f"{name}={lock[name]}", "a position in rad or m")
     for name in tree.limits:
         if elements[name].find("mimic") is not None:
             lock.setdefault(name, None)

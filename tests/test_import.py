@@ -99,6 +99,31 @@ def test_the_command_writes_a_robot_that_loads_and_simulates(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "args",
+    [
+        ("robot", "ARM", "--out", "x", "--lock", "joint_1=nan"),
+        ("robot", "ARM", "--out", "x", "--lock", "joint_1=left"),
+        ("robot", "ARM", "--out", "log.csv"),
+        ("robot", "ARM", "--out", "log.csv/x"),
+        ("robot", "log.csv", "--out", "x"),
+        ("robot", ".", "--out", "x"),
+        ("convert", "log.csv", "--robot", "ur10", "--guess", "--map", "x"),
+        ("convert", ".", "--robot", "ur10", "--guess", "--map", "x"),
+        ("convert", "log.csv", "--robot", "ur10", "--map", "no_such_map", "--out", "x"),
+        ("convert", "log.csv", "--robot", "ur10", "--map", "log.csv", "--out", "x"),
+        ("convert", "log.csv", "--robot", "ur10", "--map", "emps_drive"),
+    ],
+    ids=" ".join,
+)
+def test_bad_usage_is_one_line_and_leaves_nothing(tmp_path, args):
+    (tmp_path / "log.csv").write_text("a,b\n1,2\n")
+    args = [str(load_robot("irb").urdf) if a == "ARM" else a for a in args]
+    run = subprocess.run([sys.executable, "-m", "ident.cli", *args], capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path)
+    assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1, run.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+
+
+@pytest.mark.parametrize(
     ("urdf", "lock", "found"),
     [
         (None, {}, "no such file"),

@@ -118,6 +118,8 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
     file = Path(path)
     if not exists(file) and exists(SHIPPED / f"{path}.toml") and file.name == str(path):
         file = SHIPPED / f"{path}.toml"
+    if not exists(file):
+        raise DataError("map", str(path), "no such file", f"a map, or one of {sorted(p.stem for p in SHIPPED.glob('*.toml'))}")
     where = str(file)
     data = read_toml(file, "map")
     stray = set(data) - KEYS
