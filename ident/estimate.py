@@ -8,13 +8,13 @@ theory.md 4). The logarithm is taken of the ratio, so that no phase has to be un
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.optimize
+import scipy.linalg
 
 from ident.frf import FRF
-from ident.graybox import Parameters, Structure, equilibrium, linearise, parameter_names, sampled_frf
+from ident.graybox import Linearisation, Parameters, Structure, equilibrium, linearise, parameter_names, sampled_frf
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("nls", "wnls", "lls", "wlls")
@@ -22,6 +22,11 @@ LOG_SNR = 3.0  # entries below this ratio of size to deviation are left out of l
 UNDETERMINED = 0.2  # relative standard deviation
 UNSEEN = 1e4
 ROUNDS = 3  # linearisations anew at the equilibrium of the last estimate
+SETTLED = 1e-7  # change of the log-parameters by which a new equilibrium no longer matters
+SEARCH, FINAL = 1e-3, 1e-8  # predicted relative fall of the cost at which a search, and the fit, stop
+REACH = 6.0  # bound on the change of a log-parameter in one minimisation
+PORTION = 32  # lines evaluated at a time
+TIMING = 0.6  # bound on the timing, samples
 NULL = 1e-12  # share of the scaled information below which a direction counts as unseen
 
 
@@ -83,23 +88,27 @@ def fit_frf(
         raise DataError("FRF", "fit_frf", f"{frf.G.shape[-1]} motors", f"{structure.n}, those of the arm")
     if estimator in ("wnls", "wlls") and not np.all(np.einsum("qfii->qfi", frf.covariance).real > 0):
         raise DataError("covariance", "fit_frf", "an entry without variance", "a positive one for each")
-    starts = tuple(starts) if starts else _starts(nominal, seed)
-    found = [_minimise(structure, frf, p, sample_time, hold, "lls", 40) for p in starts]
-    best = min(found, key=lambda f: f[1])[0]
+    search = _Criterion.of(structure, frf, sample_time, hold, "lls")
+    found = [_minimise(search, p, SEARCH) for p in (tuple(starts) if starts else _starts(nominal, seed))]
+    best = min(found, key=lambda f: f.cost).parameters
+    criterion = search if estimator == "lls" else _Criterion.of(structure, frf, sample_time, hold, estimator)
     for _ in range(ROUNDS):
-        best, cost = _minimise(structure, frf, best, sample_time, hold, estimator, 60)
-    J, C = _whole(structure, frf, best, sample_time, hold, estimator)
-    H = np.einsum("kip,kij,kjq->pq", J.conj(), C["W"], J, optimize=True).real
-    WLW = C["W"] @ C["Lambda"] @ C["W"]
-    B = 0.5 * np.einsum("kip,kij,kjq->pq", J.conj(), WLW, J, optimize=True).real
+        last, result = best.to_log(), _minimise(criterion, best, FINAL)
+        best = result.parameters
+        if np.max(np.abs(best.to_log() - last)) < SETTLED:
+            break
+    # From the timing in samples, in which it was fitted, to seconds.
+    unit = np.append(np.ones(len(result.H) - 1), sample_time)
+    H = result.H / np.outer(unit, unit)
+    B = 0.5 * H if estimator in ("wnls", "wlls") else 0.5 * criterion.scatter(best) / np.outer(unit, unit)
     covariance = _sandwich(H, B)
-    count = int(C["mask"].sum())
+    count = int(criterion.mask.sum())
     if estimator in ("wnls", "wlls"):
-        covariance *= max(1.0, cost / max(count - len(H) / 2, 1.0))
+        covariance *= max(1.0, result.cost / max(count - len(H) / 2, 1.0))
     names = (*parameter_names(structure.robot), "timing")
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:-1]
     loose = tuple(n for n, s in zip(names[:-1], std, strict=True) if not s < UNDETERMINED)
-    return Estimate(best, names, covariance, cost, count, loose, estimator)
+    return Estimate(best, names, covariance, result.cost, count, loose, estimator)
 
 
 def _sandwich(H: np.ndarray, B: np.ndarray) -> np.ndarray:
@@ -123,86 +132,140 @@ def _starts(nominal: Parameters, seed: int) -> tuple[Parameters, ...]:
     return (nominal, *(nominal.with_log(x + rng.uniform(-0.7, 0.7, len(x))) for _ in range(2)))
 
 
-def _weights(frf: FRF, estimator: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weight, covariance of the residual, and mask: (Q F, n n, n n) twice and (Q F, n n)."""
-    Q, F, n, _ = frf.G.shape
-    g = np.swapaxes(frf.G, -1, -2).reshape(Q * F, n * n)
-    Lambda = frf.covariance.reshape(Q * F, n * n, n * n)
-    k = np.arange(n * n)
-    std = np.sqrt(Lambda[:, k, k].real)
-    mask = np.ones(g.shape, bool)
-    if estimator in ("lls", "wlls"):
-        mask = np.abs(g) > LOG_SNR * std
-        scale = 1.0 / np.where(mask, g, 1.0)
-        Lambda = scale[:, :, None] * Lambda * scale.conj()[:, None, :]
-    Lambda = Lambda * (mask[:, :, None] & mask[:, None, :])
-    if estimator in ("nls", "lls"):
-        W = np.zeros_like(Lambda)
-        W[:, k, k] = mask
-        return W, Lambda, mask
-    full = Lambda.copy()
-    full[:, k, k] += ~mask + 1e-9 * np.einsum("kii->k", Lambda).real[:, None] / (n * n)
-    W = np.linalg.inv(full) * (mask[:, :, None] & mask[:, None, :])
-    return W, Lambda, mask
+@dataclass(frozen=True)
+class _Criterion:
+    """What is minimised, over all K = Q F lines of all operating points.
 
+    Attributes:
+        g: (K, n n) measured, columns stacked. mask: (K, n n) entries that count.
+        root: (K, n n, n n) with ``root^H root`` the weight, or None where that is the mask.
+        Lambda: (K, n n, n n) covariance of the residual.
+    """
 
-def _whole(
-    structure: Structure, frf: FRF, par: Parameters, sample_time: float, hold: str, estimator: str
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Derivative of the residual (Q F, n n, p), and weight, covariance and mask."""
-    W, Lambda, mask = _weights(frf, estimator)
-    lins = [linearise(structure, equilibrium(structure, par, q)) for q in frf.q0]
-    _, J = _residual(structure, frf, par, lins, sample_time, hold, estimator, mask)
-    return J, {"W": W, "Lambda": Lambda, "mask": mask}
+    structure: Structure
+    frf: FRF
+    sample_time: float
+    hold: str
+    logarithmic: bool
+    g: np.ndarray
+    mask: np.ndarray
+    root: np.ndarray | None
+    Lambda: np.ndarray
 
-
-def _residual(structure, frf, par, lins, sample_time, hold, estimator, mask) -> tuple[np.ndarray, np.ndarray]:
-    n = structure.n
-    rs, Js = [], []
-    for G, lin in zip(frf.G, lins, strict=True):
-        model, dG = sampled_frf(structure, par, lin, frf.frequency, sample_time, hold, derivatives=True)
-        flat = lambda X: np.swapaxes(X, 1, 2).reshape(len(X), n * n, *X.shape[3:])  # noqa: E731
-        g, m, d = flat(G), flat(model), flat(dG)
+    @classmethod
+    def of(cls, structure: Structure, frf: FRF, sample_time: float, hold: str, estimator: str) -> _Criterion:
+        """The criterion of one of ``ESTIMATORS``."""
+        Q, F, n, _ = frf.G.shape
+        g = np.swapaxes(frf.G, -1, -2).reshape(Q * F, n * n)
+        Lambda = frf.covariance.reshape(Q * F, n * n, n * n)
+        k = np.arange(n * n)
+        std = np.sqrt(Lambda[:, k, k].real)
+        mask = np.ones(g.shape, bool)
         if estimator in ("lls", "wlls"):
+            mask = np.abs(g) > LOG_SNR * std
+            scale = 1.0 / np.where(mask, g, 1.0)
+            Lambda = scale[:, :, None] * Lambda * scale.conj()[:, None, :]
+        if not mask.all():
+            Lambda = Lambda * (mask[:, :, None] & mask[:, None, :])
+        root = None
+        if estimator in ("wnls", "wlls"):
+            full = Lambda.copy()
+            full[:, k, k] += ~mask + 1e-9 * np.einsum("kii->k", Lambda).real[:, None] / (n * n)
+            # Lambda = C C^H, hence the root of its inverse; masked entries stand alone in it.
+            root = np.linalg.inv(np.linalg.cholesky(full))
+        return cls(structure, frf, sample_time, hold, estimator in ("lls", "wlls"), g, mask, root, Lambda)
+
+    def linearised(self, par: Parameters) -> Linearisation:
+        """Matrices at the equilibrium of every operating point, one for each line of each."""
+        lins = [linearise(self.structure, equilibrium(self.structure, par, q)) for q in self.frf.q0]
+        M, Kg = (np.repeat([getattr(lin, name) for lin in lins], len(self.frf.frequency), axis=0) for name in ("M", "Kg"))
+        return Linearisation(np.empty(0), M, Kg, np.empty(0))
+
+    def at(self, start: Parameters, x: np.ndarray) -> Parameters:
+        """Parameters of the coordinates: logarithms, then the timing in samples."""
+        return replace(start.with_log(x[:-1]), timing=float(x[-1] * self.sample_time))
+
+    def residual(self, par: Parameters, lin: Linearisation, part: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Residual (k, n n) and derivative (k, n n, p) of some lines, unweighted, masked entries zero.
+
+        The last derivative is by the timing in samples.
+        """
+        g, mask = self.g[part], self.mask[part]
+        frequency = np.tile(self.frf.frequency, len(self.frf.q0))[part]
+        lin = Linearisation(lin.q, lin.M[part], lin.Kg[part], lin.g)
+        model, dG = sampled_frf(self.structure, par, lin, frequency, self.sample_time, self.hold, derivatives=True)
+        m = np.swapaxes(model, 1, 2).reshape(g.shape)
+        J = np.swapaxes(dG, 1, 2).reshape(*g.shape, -1)
+        J[..., -1] *= self.sample_time
+        if self.logarithmic:
             safe = np.where(np.abs(m) > 1e-300, m, 1e-300)
-            rs.append(np.log(np.where(g == 0, 1.0, g) / safe))
-            Js.append(-d / safe[..., None])
+            r = np.log(np.where(mask, g, safe) / safe)
+            J *= np.where(mask, -1.0 / safe, 0.0)[..., None]
+            return r, J
+        return g - m, np.negative(J, out=J)
+
+    @property
+    def parts(self) -> list[slice]:
+        """The lines in portions that stay in the cache."""
+        return [slice(k, k + PORTION) for k in range(0, len(self.g), PORTION)]
+
+    def normal(self, par: Parameters, lin: Linearisation) -> tuple[float, np.ndarray, np.ndarray]:
+        """Cost, half its gradient (p,) and the Gauss-Newton matrix (p, p)."""
+        cost, g, H = 0.0, 0.0, 0.0
+        for part in self.parts:
+            r, J = self.residual(par, lin, part)
+            if self.root is not None:
+                r, J = (self.root[part] @ r[..., None])[..., 0], self.root[part] @ J
+            r, J = r.ravel(), J.reshape(-1, J.shape[-1])
+            cost, g = cost + np.vdot(r, r).real, g + (r.conj() @ J).real
+            H = H + scipy.linalg.blas.zherk(1.0, J.T).real
+        return float(cost), g, np.triu(H) + np.triu(H, 1).T
+
+    def scatter(self, par: Parameters) -> np.ndarray:
+        """``Re J^H Lambda J``, the spread of the gradient of an unweighted criterion; (p, p)."""
+        lin, B = self.linearised(par), 0.0
+        for part in self.parts:
+            _, J = self.residual(par, lin, part)
+            B = B + np.tensordot(J.conj(), self.Lambda[part] @ J, ((0, 1), (0, 1))).real
+        return B
+
+
+@dataclass(frozen=True)
+class _Minimum:
+    parameters: Parameters
+    cost: float
+    H: np.ndarray
+
+
+def _minimise(criterion: _Criterion, start: Parameters, tolerance: float, steps: int = 60) -> _Minimum:
+    """Levenberg-Marquardt on the normal equations, equilibria held at those of the start.
+
+    Damping by the diagonal, raised and lowered by Nielsen's rule (Madsen, Nielsen and Tingleff 2004,
+    algorithm 3.16). A step that promises less than ``tolerance`` of the cost is taken and is the last.
+    """
+    lin = criterion.linearised(start)
+    x = np.append(start.to_log(), np.clip(start.timing / criterion.sample_time, -TIMING, TIMING))
+    low, high = np.append(x[:-1] - REACH, -TIMING), np.append(x[:-1] + REACH, TIMING)
+    cost, g, H = criterion.normal(criterion.at(start, x), lin)
+    damping, growth = 1e-3, 2.0
+    for _ in range(steps):
+        # A coordinate at its bound stays there while the cost would fall beyond it.
+        free = ~(((x <= low) & (g > 0)) | ((x >= high) & (g < 0)))
+        size = np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
+        A = (H / np.outer(size, size) + damping * np.eye(len(x)))[np.ix_(free, free)]
+        step = np.zeros_like(x)
+        step[free] = -np.linalg.solve(A, g[free] / size[free]) / size[free]
+        step = np.clip(x + step, low, high) - x
+        promised = -(2 * g @ step + step @ H @ step)
+        if promised <= tolerance * cost and damping < 1e-2:
+            return _Minimum(criterion.at(start, x + step), max(cost - max(promised, 0.0), 0.0), H)
+        trial = criterion.normal(criterion.at(start, x + step), lin)
+        gain = (cost - trial[0]) / promised if promised > 0 else -1.0
+        if gain > 0:
+            x, (cost, g, H) = x + step, trial
+            damping, growth = max(damping * max(1 / 30, 1 - (2 * gain - 1) ** 3), 1e-9), 2.0
+        elif np.max(np.abs(step)) < 1e-12:
+            break
         else:
-            rs.append(g - m)
-            Js.append(-d)
-    r, J = np.concatenate(rs), np.concatenate(Js)
-    return np.where(mask, r, 0.0), np.where(mask[..., None], J, 0.0)
-
-
-def _minimise(
-    structure: Structure, frf: FRF, start: Parameters, sample_time: float, hold: str, estimator: str, steps: int
-) -> tuple[Parameters, float]:
-    W, _, mask = _weights(frf, estimator)
-    root = np.swapaxes(np.linalg.cholesky(W + 1e-300 * np.eye(W.shape[1])), -1, -2).conj() if estimator in ("wnls", "wlls") else W
-    lins = [linearise(structure, equilibrium(structure, start, q)) for q in frf.q0]
-    x0 = np.append(start.to_log(), start.timing / sample_time)
-
-    def at(x: np.ndarray) -> Parameters:
-        par = start.with_log(x[:-1])
-        return type(par)(**{**par.__dict__, "timing": float(x[-1] * sample_time)})
-
-    def evaluate(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        r, J = _residual(structure, frf, at(x), lins, sample_time, hold, estimator, mask)
-        J[..., -1] *= sample_time
-        r, J = (root @ r[..., None])[..., 0].ravel(), (root @ J).reshape(-1, J.shape[-1])
-        return np.concatenate([r.real, r.imag]), np.concatenate([J.real, J.imag])
-
-    cache: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-
-    def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        key = x.tobytes()
-        if key not in cache:
-            cache.clear()
-            cache[key] = evaluate(x)
-        return cache[key]
-
-    bounds = (np.append(x0[:-1] - 6, -0.6), np.append(x0[:-1] + 6, 0.6))
-    result = scipy.optimize.least_squares(
-        lambda x: both(x)[0], np.clip(x0, *bounds), jac=lambda x: both(x)[1], bounds=bounds, x_scale="jac", max_nfev=steps, xtol=1e-10, ftol=1e-10
-    )
-    return at(result.x), float(2 * result.cost)
+            damping, growth = damping * growth, 2 * growth
+    return _Minimum(criterion.at(start, x), cost, H)

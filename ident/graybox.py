@@ -339,6 +339,7 @@ def sampled_frf(
     """FRF from recorded motor torque to sampled motor acceleration ``(j w)^2 q``.
 
     Args:
+        lin: at one posture, or with M and Kg (F, N, N), one for each frequency.
         frequency: (F,) Hz, above zero and below Nyquist.
         derivatives: also return the derivative by each entry of ``Parameters.to_log`` and, last,
             by ``timing``.
@@ -359,13 +360,14 @@ def sampled_frf(
     G[:, k, k] += (s**2 * alias)[:, None] / par.inertia
     if not derivatives:
         return G, None
-    dZ_left, dZ_right = impedance_derivatives(structure, par, s, A_inv, C)
-    dG = -gain[..., None] * np.einsum("fij,fjp,fpk,fkl->filp", Y, dZ_left, dZ_right, Y, optimize=True)
-    n = structure.n
-    for j in range(n):
-        dG[:, j, j, 2 * n + j] -= s**2 * alias / par.inertia[j]
-    d_timing = (-s)[:, None, None] * gain * Y
-    return G, np.concatenate([dG, d_timing[..., None]], axis=3)
+    left, right = impedance_derivatives(structure, par, s, A_inv, C)
+    # Laid out with the columns of G first: an FRF is stacked by columns.
+    rows, columns, n = gain * (Y @ left), np.swapaxes(right @ Y, 1, 2), structure.n
+    dG = np.empty((len(s), n, n, left.shape[2] + 1), complex)
+    np.multiply(columns[:, :, None], -rows[:, None], out=dG[..., :-1])
+    dG[:, k, k, 2 * n + k] -= (s**2 * alias)[:, None] / par.inertia
+    dG[..., -1] = np.swapaxes((-s)[:, None, None] * gain * Y, 1, 2)
+    return G, np.swapaxes(dG, 1, 2)
 
 
 def spring_deflections(

@@ -28,7 +28,7 @@ from ident.graybox import Linearisation, Parameters, Structure, equilibrium, imp
 from robot_assets.errors import DataError
 
 LOOP_DAMPING = 0.7  # of the position loop that holds a posture
-CHUNK = 128  # lines of postures at a time: few enough that memory is not handed back and fetched anew
+CHUNK = 128  # lines of postures at a time: few enough that their matrices stay in the cache
 
 
 @dataclass(frozen=True)
