@@ -14,7 +14,7 @@ import scipy.signal
 
 from ident.dataset import Dataset, Segment
 from ident.graybox import Structure, build_structure
-from ident.noise import difference_noise
+from ident.records import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
 

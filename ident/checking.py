@@ -17,7 +17,7 @@ from ident.channel_checks import (
     unit_warnings,
 )
 from ident.dataset import Dataset, Segment
-from ident.noise import difference_noise
+from ident.records import difference_noise
 from robot_assets.robot import linear_joints
 
 CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")

@@ -14,8 +14,8 @@ from ident.extended import Effect, Prediction, predict
 from ident.gain import measure_gain, segment_errors
 from ident.graybox import Parameters, build_structure, parameter_names, parameter_unit
 from ident.inverse import Sampling
-from ident.noise import difference_noise, sample_noise
-from ident.records import Group, build_groups
+from ident.noise import sample_noise
+from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
 from ident.torque_fit import Fit, Problem, fit
 from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict

@@ -23,7 +23,7 @@ from ident.inverse import (
     solve,
     true_position,
 )
-from ident.records import Group
+from ident.records import NOISE_LINES, Group, mean_over_lines
 
 LOOP_REFINEMENT = 2  # time grid of a gear's loop, in multiples of that of other laws
 
@@ -60,7 +60,8 @@ class Model:
 class Prediction:
     """What a model predicts for a group, and what it was computed with.
 
-    ``added_stiffness`` (n,): of effects in parallel with the gears, about the motion, N m/rad.
+    ``added_stiffness`` (n,): of effects in parallel with the gears, about the motion, N m/rad;
+    ``at_motor``: effects at the motors.
     """
 
     structure: Structure
@@ -69,6 +70,7 @@ class Prediction:
     solution: Solution
     U: np.ndarray
     added_stiffness: np.ndarray
+    at_motor: tuple[Effect, ...]
 
     def motion(self, group: Group) -> Motion:
         return Motion(group, self.solution, self.par)
@@ -85,6 +87,29 @@ class Prediction:
             stiffness = np.maximum(self.par.stiffness + self.added_stiffness, 0.05 * self.par.stiffness)
             Z = impedance(self.structure, replace(self.par, stiffness=stiffness), self.plane.lin, self.plane.s)[0]
         return self.plane.record[:, None, None] * Z
+
+
+    def law_noise(self, group: Group) -> np.ndarray:
+        """(L, n) power that position noise leaves in the torque through laws at the motors, N2 m2.
+
+        A friction that turns within a small velocity carries the noise of a motor that stands still
+        with the slope of the turn. By one draw of the noise over all records.
+        """
+        out = np.zeros(self.U.shape[1:])
+        if not self.at_motor:
+            return out
+        rng = np.random.default_rng(0)
+        draw = rng.normal(size=(2, *self.U.shape)) * np.sqrt(0.5 * group.position_noise)
+        noisy = replace(self.solution, Q=self.solution.Q + draw[0] + 1j * draw[1])
+        for effect in self.at_motor:
+            j = effect.hypothesis.joint
+            k = self.par.stiffness[j]
+            with_noise, without = (
+                effect.hypothesis.law(effect.p, Motion(group, x, self.par), j, k) for x in (noisy, self.solution)
+            )
+            change = self.plane.record * self.motion(group).lines(with_noise - without)
+            out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
+        return out
 
 
 def predict(
@@ -147,7 +172,7 @@ def predict_at(
         U[..., j] = effect.hypothesis.law(
             effect.p, Motion(group, solution, par), j, par.stiffness[j], U[..., j]
         )
-    return Prediction(structure, par, plane, solution, U, _added_stiffness(solution, by_channel.get("spring", [])))
+    return Prediction(structure, par, plane, solution, U, _added_stiffness(solution, by_channel.get("spring", [])), tuple(motor))
 
 
 def _added_stiffness(solution: Solution, effects: Sequence[Effect]) -> np.ndarray:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.extended import Model, Prediction, predict
-from ident.noise import residual_covariance
 from ident.records import Group
-from ident.torque_fit import Problem
+from ident.torque_fit import Problem, noise_covariance
 from ident.verdict import Gain
 
 METRIC = "RMS motor-torque prediction error, N m"
@@ -38,10 +37,7 @@ def segment_errors(
         a = predict(before, group, problem.sampling)
         b = predict(after, group, problem.sampling)
         pairs.append((a, b))
-        Z = b.sampled_impedance
-        S = residual_covariance(
-            group, Z, tau_std=problem.tau_std, q_std=problem.q_std, samples=problem.samples(group)
-        )
+        S = noise_covariance(problem, group, b)
         share = 1.0 if group.window is None else float(np.mean(group.window**2))
         noise = share * np.einsum("kii->ki", S).real
         names += group.segments

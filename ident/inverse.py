@@ -123,12 +123,12 @@ class Motion:
     par: Parameters
 
     def q(self, joint: int) -> np.ndarray:
-        """Motor position, rad."""
-        return self._time(self.solution.Q, joint)
+        """Motor position without lines of noise alone, rad."""
+        return self._time(self.solution.Q, joint, share=self.group.signal_share[..., joint])
 
     def v(self, joint: int) -> np.ndarray:
-        """Motor velocity, rad/s."""
-        return self._time(self.solution.Q, joint, 1)
+        """Motor velocity without lines of noise alone, rad/s."""
+        return self._time(self.solution.Q, joint, 1, self.group.signal_share[..., joint])
 
     def acceleration(self, joint: int) -> np.ndarray:
         """Motor acceleration, rad/s2."""
@@ -173,8 +173,9 @@ class Motion:
         """Time signal (S, T) to spectrum (S, L)."""
         return self.group.to_lines(x[..., None])[..., 0]
 
-    def _time(self, X: np.ndarray, column: int, order: int = 0) -> np.ndarray:
-        x = X[..., column] * (1j * self.group.omega) ** order if order else X[..., column]
+    def _time(self, X: np.ndarray, column: int, order: int = 0, share: np.ndarray | float = 1.0) -> np.ndarray:
+        x = share * X[..., column]
+        x = x * (1j * self.group.omega) ** order if order else x
         return self.group.to_time(x[..., None])[..., 0]
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.optimize
 
-from ident.records import Group
+from ident.records import Group, mean_over_lines
 
 PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
@@ -86,15 +86,6 @@ def sample_noise(group: Group, Z: np.ndarray, samples: int) -> tuple[np.ndarray,
     return np.sqrt(tau_var * samples), np.sqrt(q_var * samples)
 
 
-def difference_noise(x: np.ndarray) -> np.ndarray:
-    """Standard deviation of white noise on a smooth signal (N, n), from fourth differences; (n,).
-
-    ``var(diff^4 x) = 70 var(x)`` for white noise; the median makes it blind to spikes.
-    """
-    d = np.diff(x, n=4, axis=0)
-    return 1.4826 * np.median(np.abs(d - np.median(d, axis=0)), axis=0) / np.sqrt(70.0)
-
-
 def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Non-negative channel variances that explain the line power (K, n) of the residual."""
     n = power.shape[1]
@@ -120,8 +111,5 @@ def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean over lines k-half..k+half, and how many lines entered."""
-    total = np.cumsum(np.concatenate([np.zeros_like(x[:1]), x]), axis=0)
     k = np.arange(len(x))
-    low, high = np.maximum(k - half, 0), np.minimum(k + half + 1, len(x))
-    count = high - low
-    return (total[high] - total[low]) / count[:, None, None], count
+    return mean_over_lines(x, half), np.minimum(k + half + 1, len(x)) - np.maximum(k - half, 0)

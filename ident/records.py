@@ -8,6 +8,7 @@ keeps the return and the first transient out of every comparison.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.fft
@@ -18,6 +19,8 @@ from robot_assets.errors import DataError
 RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: what still rings then has decayed
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
+NOISE_LINES = 10  # lines on either side over which the noise of the position is averaged
+SIGNAL_LEVEL = 2.0  # power over noise below which a line of the position counts as noise
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
 
 
@@ -43,6 +46,7 @@ class Group:
         temperature: (S, n) degC means, or None.
         period_time: s.
         periods: (S,) number of periods averaged.
+        white_noise: (n,) variance of a line of one period by the noise of its samples, rad2.
     """
 
     operating_point: str
@@ -62,6 +66,32 @@ class Group:
     temperature: np.ndarray | None
     period_time: float
     periods: np.ndarray
+    white_noise: np.ndarray
+
+    @cached_property
+    def position_noise(self) -> np.ndarray:
+        """(L, n) variance of a line of the mean position, rad2.
+
+        By the scatter between periods; white where there is one period, by the noise of its samples.
+        """
+        P = self.Q_periods.shape[1]
+        if P < 2:
+            return np.ones((len(self.omega), 1)) * self.white_noise
+        d = self.Q_periods - self.Q_periods.mean(axis=1, keepdims=True)
+        power = np.sum(np.abs(d) ** 2, axis=(0, 1)) / (len(d) * (P - 1) * P)
+        return mean_over_lines(power, NOISE_LINES)
+
+    @cached_property
+    def signal_share(self) -> np.ndarray:
+        """(S, L, n) share of each line of the position that is signal, 0 to 1.
+
+        Laws that turn on a reversal see a noisy position reverse where the joint stands still; they
+        are shown the motion without the lines that hold noise alone.
+        """
+        share = 1.0 - SIGNAL_LEVEL * self.position_noise / np.maximum(np.abs(self.Q) ** 2, 1e-300)
+        share = np.maximum(share, 0.0)
+        share[:, 0] = 1.0
+        return share
 
     @property
     def posture(self) -> np.ndarray:
@@ -166,6 +196,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) ->
         temperature=None if any(x is None for x in temps) else np.stack([x.mean(axis=0) for x in temps]),
         period_time=N / fs,
         periods=np.array([s.steady_periods for s in members]),
+        white_noise=np.mean([difference_noise(s.q) ** 2 for s in members], axis=0) / N,
     )
 
 
@@ -217,6 +248,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
         temperature=None if segment.temp is None else segment.temp.mean(axis=0)[None],
         period_time=N / fs,
         periods=np.ones(1, int),
+        white_noise=difference_noise(segment.q) ** 2 / N,
     )
 
 
@@ -235,3 +267,20 @@ def close_motion(x: np.ndarray, n_return: int) -> np.ndarray:
     leave = u - 6 * u**3 + 8 * u**4 - 3 * u**5
     arrive = -4 * u**3 + 7 * u**4 - 3 * u**5
     return np.concatenate([x, x[-1] + (x[0] - x[-1]) * s + v_end * leave + v_start * arrive])
+
+
+def mean_over_lines(x: np.ndarray, half: int) -> np.ndarray:
+    """Mean of (L, ...) over lines l - half .. l + half."""
+    total = np.cumsum(np.concatenate([np.zeros_like(x[:1]), x]), axis=0)
+    at = np.arange(len(x))
+    low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, len(x))
+    return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (x.ndim - 1))
+
+
+def difference_noise(x: np.ndarray) -> np.ndarray:
+    """Standard deviation of white noise on a smooth signal (N, n), from fourth differences; (n,).
+
+    ``var(diff^4 x) = 70 var(x)`` for white noise; the median makes it blind to spikes.
+    """
+    d = np.diff(x, n=4, axis=0)
+    return 1.4826 * np.median(np.abs(d - np.median(d, axis=0)), axis=0) / np.sqrt(70.0)

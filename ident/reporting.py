@@ -9,9 +9,8 @@ import numpy as np
 from ident.dataset import Dataset
 from ident.extended import Model, Prediction, predict
 from ident.graybox import equilibrium, linearise, sampled_frf
-from ident.noise import residual_covariance
 from ident.records import Group
-from ident.torque_fit import Fit, Problem, residual
+from ident.torque_fit import Fit, Problem, noise_covariance, residual
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
 
 BANDS = 8
@@ -66,14 +65,7 @@ def spectrum_map(
         band = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, BANDS - 1)
         weight = np.where(frequency > 0, 2.0, 1.0)[:, None]
         pred = after[g]
-        S = residual_covariance(
-            group,
-            pred.sampled_impedance,
-            tau_std=problem.tau_std,
-            q_std=problem.q_std,
-            samples=problem.samples(group),
-        )
-        noise = np.einsum("kii->ki", S).real
+        noise = np.einsum("kii->ki", noise_covariance(problem, group, pred)).real
         powers = [np.mean(np.abs(residual(group, p)) ** 2, axis=0) for p in (before[g], pred)]
         for i, power in enumerate([*powers, noise]):
             np.add.at(out[i, g].T, band, power * weight)

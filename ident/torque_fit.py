@@ -101,14 +101,26 @@ class Fit:
         return np.linalg.pinv(self.information + ridge, hermitian=True) * max(1.0, self.chi2_per_dof)
 
 
+def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> np.ndarray:
+    """Covariance of the compared lines of the torque residual by noise alone; (K, n, n) N2 m2."""
+    S = residual_covariance(
+        group,
+        prediction.sampled_impedance,
+        tau_std=problem.tau_std,
+        q_std=problem.q_std,
+        samples=problem.samples(group),
+    )
+    k = np.arange(S.shape[1])
+    S = S.copy()
+    S[:, k, k] += prediction.law_noise(group)[group.keep]
+    return S
+
+
 def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float) -> Weights:
     """Weights at the current model; ``rho`` is a relative error added to the noise."""
     whiten, covariance = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
-        Z = pred.sampled_impedance
-        S = residual_covariance(
-            group, Z, tau_std=problem.tau_std, q_std=problem.q_std, samples=problem.samples(group)
-        )
+        S = noise_covariance(problem, group, pred)
         if group.window is not None:
             S = S * np.mean(group.window**2)
         S = S.copy()
