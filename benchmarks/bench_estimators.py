@@ -1,20 +1,25 @@
 """Estimators side by side.
 
-H1, JIO, ARI, HAR and LOG: bias on a synthetic closed loop over noise. NLS, WNLS, LLS, WLLS and the
-torque-residual fit: errors on one effect-free UR10 data set.
+H1, JIO, ARI, HAR and LOG: bias on a synthetic closed loop over noise. NLS, WNLS, LLS and WLLS: mean square
+error over the Cramer-Rao bound and coverage of intervals on FRFs of the irb, the time of a fit, and how it
+grows. The same and the torque-residual fit: errors on one effect-free UR10 data set.
+
+    python benchmarks/bench_estimators.py [DRAWS]
 """
 
 from __future__ import annotations
 
+import sys
 import time
 
 import numpy as np
 
 from ident.diagnose import identify
 from ident.estimate import ESTIMATORS, fit_frf
-from ident.excitation import make_plan, operating_points
-from ident.frf import Blocks, average, estimate_frf
-from ident.graybox import Parameters, build_structure
+from ident.excitation import LOOP_HZ, Excitation, make_plan, operating_points
+from ident.frf import FRF, Blocks, average, estimate_frf
+from ident.graybox import Parameters, Structure, build_structure, impedance, parameter_names, sampled_frf
+from ident.information import LOOP_DAMPING, Conditions, conditions, linearised
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import draw_drives
@@ -55,8 +60,120 @@ def bias_table(draws: int = 100) -> None:
     print()
 
 
-def main() -> None:
+RELATIVE = 0.03  # median relative deviation of an FRF entry in the Monte Carlo
+
+
+def exact(structure: Structure, par: Parameters, postures: np.ndarray, given: Conditions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """FRF vectors (Q, F, n n), their derivatives (Q, F, n n, p) and roots of their covariance, noise of ``given``."""
+    n, s, k = structure.n, 2j * np.pi * given.frequency, np.arange(structure.n)
+    g, dg, roots = [], [], []
+    for lin in linearised(structure, par, postures):
+        G, dG = sampled_frf(structure, par, lin, given.frequency, 1e-3, "zoh", derivatives=True)
+        Z, _, _ = impedance(structure, par, lin, s)
+        inertia, w = par.inertia + np.diag(lin.M)[structure.driven], 2 * np.pi * LOOP_HZ
+        closed = Z.copy()
+        closed[:, k, k] += inertia * (w**2 + 2 * LOOP_DAMPING * w * s[:, None])
+        U = Z @ (np.linalg.inv(closed) * (0.5 * np.sqrt(n) * given.amplitude)[:, None, :])
+        Phi = (G * given.tau_std**2) @ np.conj(np.swapaxes(G, 1, 2))
+        Phi[:, k, k] += np.abs(s[:, None]) ** 4 * given.q_std**2
+        # Error E U^-1 with columns of E of covariance Phi: the root of its covariance is U^-T kron root(Phi).
+        half = np.linalg.cholesky(Phi / given.samples)
+        left = np.swapaxes(np.linalg.inv(U), 1, 2)
+        roots.append(np.einsum("fab,fcd->facbd", left, half).reshape(len(s), n * n, n * n))
+        g.append(np.swapaxes(G, 1, 2).reshape(len(s), n * n))
+        dg.append(np.swapaxes(dG, 1, 2).reshape(len(s), n * n, -1))
+    return np.stack(g), np.stack(dg), np.stack(roots)
+
+
+def frf_case(points: int, lines: int, seed: int = 0) -> dict:
+    """The irb at random postures, drives off nominal by up to 35 %, and noise of the size ``RELATIVE``."""
+    robot, rng = load_robot("irb"), np.random.default_rng(seed)
+    structure, nominal = build_structure(robot), Parameters.nominal(robot)
+    period, rate = 20000, 1000.0
+    grid = np.unique(np.round(np.geomspace(1.0, 60.0, lines) * period / rate).astype(int))
+    while len(grid) < lines:
+        grid = np.union1d(grid, grid[np.argmax(np.diff(grid))] + 1)
+    names = parameter_names(robot)
+    fitted = [n for n in names if n.startswith(("stiffness", "damping"))]
+    chosen = np.array([n in fitted for n in names])
+    truth = nominal.with_log(nominal.to_log() + chosen * rng.uniform(-0.3, 0.3, len(names)))
+    postures = operating_points(robot, points, rng)
+    excitation = Excitation(rate, period, 2, 1, grid, np.arange(0))
+    given = conditions(structure, excitation, linearised(structure, nominal, postures), nominal)
+    g, dg, roots = exact(structure, truth, postures, given)
+    std = np.sqrt(np.sum(np.abs(roots) ** 2, axis=-1))
+    roots = roots * RELATIVE / np.median(std / np.abs(g))
+    covariance = roots @ np.conj(np.swapaxes(roots, -1, -2))
+    J = (np.linalg.inv(roots) @ dg[..., :-1][..., chosen]).reshape(-1, chosen.sum())
+    bound = np.diag(np.linalg.inv(2 * (J.conj().T @ J).real))
+    return dict(
+        structure=structure, nominal=nominal, truth=truth, postures=postures, frequency=given.frequency, g=g,
+        roots=roots, covariance=covariance, bound=bound, fitted=fitted, chosen=chosen,
+    )
+
+
+def draw(case: dict, rng: np.random.Generator) -> FRF:
+    """One set of noisy FRFs."""
+    g, n = case["g"], case["structure"].n
+    e = (rng.normal(size=g.shape) + 1j * rng.normal(size=g.shape)) / np.sqrt(2)
+    G = np.swapaxes((g + (case["roots"] @ e[..., None])[..., 0]).reshape(*g.shape[:2], n, n), -1, -2)
+    k = np.arange(n * n)
+    std = np.swapaxes(np.sqrt(case["covariance"][..., k, k].real).reshape(*g.shape[:2], n, n), -1, -2)
+    lines, points = np.arange(1, g.shape[1] + 1), tuple(f"p{i + 1}" for i in range(len(g)))
+    return FRF(G, case["covariance"], std, std, case["frequency"], lines, points, case["postures"], 1.0, 1, 2, "jio")
+
+
+def fitted_case(case: dict, frf: FRF, estimator: str, start: Parameters):
+    """(estimate, error of the fitted log-parameters, seconds)."""
+    began = time.perf_counter()
+    fit = fit_frf(
+        case["structure"], frf, case["nominal"], sample_time=1e-3, hold="zoh", estimator=estimator, starts=(start,), fitted=case["fitted"]
+    )
+    seconds = time.perf_counter() - began
+    return fit, (fit.parameters.to_log() - case["truth"].to_log())[case["chosen"]], seconds
+
+
+def efficiency_table(draws: int = 100) -> None:
+    """Print mean square errors over the Cramer-Rao bound, coverage of 95 % intervals, and seconds a fit."""
+    case, rng = frf_case(15, 80), np.random.default_rng(1)
+    spring = np.array([name.startswith("stiffness") for name in case["fitted"]])
+    size = np.sqrt(case["bound"])
+    print(f"irb, 15 points x 80 lines, {len(spring)} parameters, {draws} draws of {RELATIVE:.0%} FRF noise; bound: springs {np.median(size[spring]):.1e}, dampers {np.median(size[~spring]):.1e} (median)")
+    out = {e: ([], [], []) for e in ESTIMATORS}
+    for _ in range(draws):
+        frf = draw(case, rng)
+        for estimator, (errors, inside, seconds) in out.items():
+            fit, error, took = fitted_case(case, frf, estimator, case["nominal"])
+            errors.append(error)
+            inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(fit.covariance)))
+            seconds.append(took)
+    print("estimator   MSE / bound: all   springs   dampers   largest    bias^2 / MSE   coverage: mean  least   seconds, median of one start")
+    for estimator, (errors, inside, seconds) in out.items():
+        e, mse = np.array(errors), np.mean(np.square(errors), axis=0)
+        ratio, covered = mse / case["bound"], np.mean(inside, axis=0)
+        print(
+            f"{estimator:10s}  {np.mean(ratio):16.2f}  {np.mean(ratio[spring]):8.2f}  {np.mean(ratio[~spring]):8.2f}  {ratio.max():8.2f}"
+            f"  {np.mean(e.mean(axis=0) ** 2 / mse):14.3f}  {covered.mean():15.3f}  {covered.min():5.2f}  {np.median(seconds):9.2f}"
+        )
+    print()
+
+
+def scaling_table() -> None:
+    """Print the time of a WLLS fit from one start over points and lines."""
+    print("seconds of a WLLS fit from one start, irb\npoints  lines: 20     80    320")
+    for points in (5, 15, 45):
+        cells = []
+        for lines in (20, 80, 320):
+            case = frf_case(points, lines)
+            cells.append(fitted_case(case, draw(case, np.random.default_rng(2)), "wlls", case["nominal"])[2])
+        print(f"{points:6d}       " + " ".join(f"{c:6.2f}" for c in cells))
+    print()
+
+
+def main(draws: int = 100) -> None:
     bias_table()
+    efficiency_table(draws)
+    scaling_table()
     robot = load_robot("ur10")
     rng = np.random.default_rng(1)
     plant = build_plant(robot)
@@ -83,4 +200,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:2]))

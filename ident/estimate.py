@@ -7,7 +7,7 @@ theory.md 4). The logarithm is taken of the ratio, so that no phase has to be un
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,8 +35,8 @@ class Estimate:
     """Result of an FRF fit.
 
     Attributes:
-        parameters: at the minimum. names: of the log-coordinates, timing last.
-        covariance: (p, p) sandwich covariance of the log-coordinates (timing in s), for the
+        parameters: at the minimum. names: of the fitted log-coordinates, timing last.
+        covariance: (p, p) sandwich covariance of those coordinates (timing in s), for the
             weighted criteria scaled by the misfit where that exceeds one. A direction that the
             data do not see has variance ``UNSEEN``.
         cost: of the criterion. residuals: count of complex residuals, masked ones left out.
@@ -68,6 +68,7 @@ def fit_frf(
     estimator: str = "wlls",
     starts: Sequence[Parameters] | None = None,
     seed: int = 0,
+    fitted: Collection[str] | None = None,
 ) -> Estimate:
     """Fit log-parameters to the FRFs of all operating points.
 
@@ -77,10 +78,11 @@ def fit_frf(
         nominal: starting guesses, and centre of the starts drawn where none are given.
         sample_time: s. hold: of the recorded torque, "zoh" or "none".
         seed: of the drawn starts.
+        fitted: names of ``parameter_names`` or "timing"; the others are held at the starts. All where None.
 
     Raises:
-        DataError: for an estimator that there is not, an arm of another number of motors, or a
-            weighted criterion and FRFs without covariance.
+        DataError: for an estimator or parameter that there is not, an arm of another number of motors, or
+            a weighted criterion and FRFs without covariance.
     """
     if estimator not in ESTIMATORS:
         raise DataError("estimator", "fit_frf", repr(estimator), f"one of {ESTIMATORS}")
@@ -88,26 +90,33 @@ def fit_frf(
         raise DataError("FRF", "fit_frf", f"{frf.G.shape[-1]} motors", f"{structure.n}, those of the arm")
     if estimator in ("wnls", "wlls") and not np.all(np.einsum("qfii->qfi", frf.covariance).real > 0):
         raise DataError("covariance", "fit_frf", "an entry without variance", "a positive one for each")
+    names = (*parameter_names(structure.robot), "timing")
+    stray = sorted(set(fitted or ()) - set(names))
+    if stray:
+        raise DataError("fitted", "fit_frf", stray[0], f"of {names}")
+    free = np.array([fitted is None or name in fitted for name in names])
     search = _Criterion.of(structure, frf, sample_time, hold, "lls")
-    found = [_minimise(search, p, SEARCH) for p in (tuple(starts) if starts else _starts(nominal, seed))]
+    found = [_minimise(search, p, free, SEARCH) for p in (tuple(starts) if starts else _starts(nominal, seed))]
     best = min(found, key=lambda f: f.cost).parameters
     criterion = search if estimator == "lls" else _Criterion.of(structure, frf, sample_time, hold, estimator)
     for _ in range(ROUNDS):
-        last, result = best.to_log(), _minimise(criterion, best, FINAL)
+        last, result = best.to_log(), _minimise(criterion, best, free, FINAL)
         best = result.parameters
         if np.max(np.abs(best.to_log() - last)) < SETTLED:
             break
     # From the timing in samples, in which it was fitted, to seconds.
-    unit = np.append(np.ones(len(result.H) - 1), sample_time)
+    unit = np.append(np.ones(len(free) - 1), sample_time)[free]
     H = result.H / np.outer(unit, unit)
-    B = 0.5 * H if estimator in ("wnls", "wlls") else 0.5 * criterion.scatter(best) / np.outer(unit, unit)
+    B = 0.5 * H
+    if estimator in ("nls", "lls"):
+        B = 0.5 * criterion.scatter(best)[np.ix_(free, free)] / np.outer(unit, unit)
     covariance = _sandwich(H, B)
     count = int(criterion.mask.sum())
     if estimator in ("wnls", "wlls"):
         covariance *= max(1.0, result.cost / max(count - len(H) / 2, 1.0))
-    names = (*parameter_names(structure.robot), "timing")
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:-1]
-    loose = tuple(n for n, s in zip(names[:-1], std, strict=True) if not s < UNDETERMINED)
+    names = tuple(name for name, use in zip(names, free, strict=True) if use)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    loose = tuple(n for n, s in zip(names, std, strict=True) if n != "timing" and not s < UNDETERMINED)
     return Estimate(best, names, covariance, result.cost, count, loose, estimator)
 
 
@@ -181,10 +190,6 @@ class _Criterion:
         M, Kg = (np.repeat([getattr(lin, name) for lin in lins], len(self.frf.frequency), axis=0) for name in ("M", "Kg"))
         return Linearisation(np.empty(0), M, Kg, np.empty(0))
 
-    def at(self, start: Parameters, x: np.ndarray) -> Parameters:
-        """Parameters of the coordinates: logarithms, then the timing in samples."""
-        return replace(start.with_log(x[:-1]), timing=float(x[-1] * self.sample_time))
-
     def residual(self, par: Parameters, lin: Linearisation, part: slice) -> tuple[np.ndarray, np.ndarray]:
         """Residual (k, n n) and derivative (k, n n, p) of some lines, unweighted, masked entries zero.
 
@@ -209,11 +214,14 @@ class _Criterion:
         """The lines in portions that stay in the cache."""
         return [slice(k, k + PORTION) for k in range(0, len(self.g), PORTION)]
 
-    def normal(self, par: Parameters, lin: Linearisation) -> tuple[float, np.ndarray, np.ndarray]:
-        """Cost, half its gradient (p,) and the Gauss-Newton matrix (p, p)."""
+    def normal(
+        self, par: Parameters, lin: Linearisation, fitted: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Cost, half its gradient and the Gauss-Newton matrix for the fitted of all coordinates."""
         cost, g, H = 0.0, 0.0, 0.0
         for part in self.parts:
             r, J = self.residual(par, lin, part)
+            J = J if fitted.all() else np.ascontiguousarray(J[..., fitted])
             if self.root is not None:
                 r, J = (self.root[part] @ r[..., None])[..., 0], self.root[part] @ J
             r, J = r.ravel(), J.reshape(-1, J.shape[-1])
@@ -237,16 +245,25 @@ class _Minimum:
     H: np.ndarray
 
 
-def _minimise(criterion: _Criterion, start: Parameters, tolerance: float, steps: int = 60) -> _Minimum:
-    """Levenberg-Marquardt on the normal equations, equilibria held at those of the start.
+def _minimise(
+    criterion: _Criterion, start: Parameters, fitted: np.ndarray, tolerance: float, steps: int = 60
+) -> _Minimum:
+    """Levenberg-Marquardt on the normal equations over the fitted coordinates (p,), equilibria those of the start.
 
     Damping by the diagonal, raised and lowered by Nielsen's rule (Madsen, Nielsen and Tingleff 2004,
     algorithm 3.16). A step that promises less than ``tolerance`` of the cost is taken and is the last.
     """
     lin = criterion.linearised(start)
-    x = np.append(start.to_log(), np.clip(start.timing / criterion.sample_time, -TIMING, TIMING))
-    low, high = np.append(x[:-1] - REACH, -TIMING), np.append(x[:-1] + REACH, TIMING)
-    cost, g, H = criterion.normal(criterion.at(start, x), lin)
+    whole = np.append(start.to_log(), np.clip(start.timing / criterion.sample_time, -TIMING, TIMING))
+    x = whole[fitted]
+    low, high = (np.append(whole[:-1] + sign * REACH, sign * TIMING)[fitted] for sign in (-1, 1))
+
+    def at(x: np.ndarray) -> Parameters:
+        moved = whole.copy()
+        moved[fitted] = x
+        return replace(start.with_log(moved[:-1]), timing=float(moved[-1] * criterion.sample_time))
+
+    cost, g, H = criterion.normal(at(x), lin, fitted)
     damping, growth = 1e-3, 2.0
     for _ in range(steps):
         # A coordinate at its bound stays there while the cost would fall beyond it.
@@ -258,8 +275,8 @@ def _minimise(criterion: _Criterion, start: Parameters, tolerance: float, steps:
         step = np.clip(x + step, low, high) - x
         promised = -(2 * g @ step + step @ H @ step)
         if promised <= tolerance * cost and damping < 1e-2:
-            return _Minimum(criterion.at(start, x + step), max(cost - max(promised, 0.0), 0.0), H)
-        trial = criterion.normal(criterion.at(start, x + step), lin)
+            return _Minimum(at(x + step), max(cost - max(promised, 0.0), 0.0), H)
+        trial = criterion.normal(at(x + step), lin, fitted)
         gain = (cost - trial[0]) / promised if promised > 0 else -1.0
         if gain > 0:
             x, (cost, g, H) = x + step, trial
@@ -268,4 +285,4 @@ def _minimise(criterion: _Criterion, start: Parameters, tolerance: float, steps:
             break
         else:
             damping, growth = damping * growth, 2 * growth
-    return _Minimum(criterion.at(start, x), cost, H)
+    return _Minimum(at(x), cost, H)

@@ -8,7 +8,7 @@ import pytest
 from ident.estimate import ESTIMATORS, UNSEEN, _sandwich, fit_frf
 from ident.excitation import operating_points
 from ident.frf import FRF
-from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
+from ident.graybox import Parameters, build_structure, equilibrium, linearise, parameter_names, sampled_frf
 from robot_assets.errors import DataError
 
 STEP = 1e-3
@@ -175,6 +175,21 @@ def test_correlations_are_of_unit_diagonal_and_starts_repeat(arm):
     one, two = fit(arm, frf, estimator="wlls", seed=3), fit(arm, frf, estimator="wlls", seed=3)
     assert np.array_equal(one.parameters.to_log(), two.parameters.to_log())
     assert np.allclose(np.diag(one.correlation), 1.0) and np.abs(one.correlation).max() < 1 + 1e-9
+
+
+def test_parameters_can_be_held(arm):
+    """The springs alone, all else known: closer than when all is fitted, and nothing else moves."""
+    structure, nominal, truth, postures = arm
+    frf = measured(model_of(structure, truth, postures), postures, np.random.default_rng(0))
+    springs = [n for n in parameter_names(structure.robot) if n.startswith("stiffness")]
+    start = replace(truth, stiffness=nominal.stiffness)
+    held, whole = fit(arm, frf, start, fitted=springs), fit(arm, frf, start)
+    assert held.names == tuple(springs) and held.covariance.shape == (6, 6)
+    assert np.array_equal(held.parameters.to_log()[6:], truth.to_log()[6:])
+    assert np.all(np.diag(held.covariance) <= np.diag(whole.covariance)[:6])
+    assert np.all(np.abs(log_error(held, truth))[:6] < 4 * np.sqrt(np.diag(held.covariance)))
+    with pytest.raises(DataError, match="mass"):
+        fit(arm, frf, fitted=["mass"])
 
 
 def test_wrong_calls_are_refused(arm):
