@@ -27,6 +27,7 @@ TORQUE_SHARE = 0.6  # of the torque limit that gravity and excitation may take t
 SPEED_SHARE = 0.5  # of the velocity limit
 PLAN_FORMAT = "simgap-plan/1"
 INJECTIONS = ("torque", "position")
+GRIDS = ("detection", "odd", "all")
 ROLES = ("identification", "validation")
 STRIDE = 10  # of the samples of a motion in a plan's file; the rest by cubic splines
 
@@ -204,6 +205,8 @@ def make_plan(
     transient_periods: int = 1,
     band_hz: tuple[float, float] = (0.4, 70.0),
     per_decade: int | None = None,
+    grid: str = "detection",
+    experiments: int | None = None,
     injection: str = "torque",
     postures: np.ndarray | None = None,
     inertia: np.ndarray | None = None,
@@ -212,7 +215,7 @@ def make_plan(
 ) -> Plan:
     """Multisines at operating points, and held-out segments.
 
-    Every identification point is measured with n experiments per realization and level, a
+    Every identification point is measured with n experiments per realization and level, or as many as given, a
     held-out one at the first level alone: two points at three levels are 36 segments of a
     six-axis arm.
 
@@ -221,6 +224,10 @@ def make_plan(
         levels_per_point: levels measured at each point, taking turns from point to point, to
             spread a budget over more points; all of them where None.
         band_hz, per_decade: see ``odd_random_grid``.
+        grid: "detection": that grid; "odd": no odd line left out; "all": every line of the band, which
+            local methods want, but which lets even distortion onto the excited lines.
+        experiments: of each realization and level, the first of the n orthogonal ones; n where None. One
+            excites all inputs at all lines, which is enough for local methods (``ident.local_frf``).
         inertia: (n,) kg m2 that each motor moves; three times its own where None.
         gravity_torque: (n,) largest static torque in the postures, N m.
 
@@ -235,8 +242,16 @@ def make_plan(
         raise DataError("band_hz", "plan", str(band_hz), f"rising, below Nyquist {0.5 * sample_rate:g} Hz")
     if not levels or not all(0 < level <= 1e3 for level in levels):
         raise DataError("levels", "plan", str(levels), "at least one number above zero")
+    if grid not in GRIDS:
+        raise DataError("grid", "plan", repr(grid), f"one of {GRIDS}")
+    count = robot.n if experiments is None else experiments
+    if not 1 <= count <= robot.n:
+        raise DataError("experiments", "plan", str(experiments), f"1 to {robot.n}")
     rng = np.random.default_rng(seed)
     lines, detection = odd_random_grid(rng, period, sample_rate, band_hz, per_decade=per_decade)
+    if grid != "detection":
+        lines, detection = np.union1d(lines, detection), detection[:0]
+        lines = np.arange(lines[0], lines[-1] + 1) if grid == "all" and len(lines) else lines
     if not len(lines):
         raise DataError("band_hz", "plan", str(band_hz), f"a band that holds odd multiples of {sample_rate / period:g} Hz")
     excitation = Excitation(sample_rate, period, periods, transient_periods, lines, detection)
@@ -253,7 +268,7 @@ def make_plan(
         for m in range(realizations):
             r = orthogonal_multisines(rng, lines, amplitudes, period)
             for level in _levels_at(i, levels, levels_per_point) if not held_out else (levels[0],):
-                for e in range(robot.n):
+                for e in range(count):
                     experiments.append(
                         Experiment(f"op{i + 1:02d}", np.asarray(q0, float), e + 1, m + 1, level, role, level * r[e])
                     )

@@ -7,6 +7,7 @@ import pytest
 import scipy.linalg
 
 from ident.dataset import Dataset, Segment
+from ident.excitation import make_plan
 from ident.frf import estimate_frf
 from ident.local_frf import estimate_local
 from robot_assets.errors import DataError
@@ -209,3 +210,16 @@ def test_what_cannot_be_estimated_is_said(ur10):
         estimate_local(replace(data, segments=(replace(s, r=s.r * [1.0, 0.0]),)))
     with pytest.raises(DataError, match=r"amplitude: arm: found 0\.5"):
         estimate_local(data, amplitude=0.5)
+
+
+def test_plans_of_one_experiment(ur10):
+    options = dict(points=1, validation_points=0, levels=(1.0,), trajectory=False, period=2000, band_hz=(1.0, 20.0))
+    plan = make_plan(ur10, grid="all", experiments=1, **options)
+    assert len(plan.experiments) == 1 and np.all(np.diff(plan.excitation.lines) == 1)
+    spectrum = np.abs(np.fft.rfft(plan.experiments[0].r, axis=0))[plan.excitation.lines]
+    assert np.all(spectrum > 1e-3 * spectrum.max(axis=0))
+    odd = make_plan(ur10, grid="odd", **options).excitation
+    assert np.all(np.diff(odd.lines) == 2) and not len(odd.detection)
+    for wrong in (dict(grid="even"), dict(experiments=0), dict(experiments=7)):
+        with pytest.raises(DataError, match=next(iter(wrong))):
+            make_plan(ur10, **wrong)
