@@ -23,6 +23,8 @@ test-all: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python benchmarks/bench_plant.py
 	$(BIN)/python benchmarks/bench_estimators.py
+	$(BIN)/python benchmarks/bench_design.py
+	$(BIN)/python benchmarks/bench_local.py
 	$(BIN)/python benchmarks/bench_diagnose.py
 
 bench-blind: $(STAMP)
