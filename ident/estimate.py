@@ -24,6 +24,7 @@ UNSEEN = 1e4
 ROUNDS = 3  # linearisations anew at the equilibrium of the last estimate
 SETTLED = 1e-7  # change of the log-parameters by which a new equilibrium no longer matters
 SEARCH, FINAL = 1e-3, 1e-8  # predicted relative fall of the cost at which a search, and the fit, stop
+STEP, SMALL = 1.0, 0.1  # longest step in a log-parameter, and what may be taken without another look
 REACH = 6.0  # bound on the change of a log-parameter in one minimisation
 PORTION = 32  # lines evaluated at a time
 TIMING = 0.6  # bound on the timing, samples
@@ -251,7 +252,7 @@ def _minimise(
     """Levenberg-Marquardt on the normal equations over the fitted coordinates (p,), equilibria those of the start.
 
     Damping by the diagonal, raised and lowered by Nielsen's rule (Madsen, Nielsen and Tingleff 2004,
-    algorithm 3.16). A step that promises less than ``tolerance`` of the cost is taken and is the last.
+    algorithm 3.16). A small step that promises less than ``tolerance`` of the cost is taken and is the last.
     """
     lin = criterion.linearised(start)
     whole = np.append(start.to_log(), np.clip(start.timing / criterion.sample_time, -TIMING, TIMING))
@@ -272,9 +273,9 @@ def _minimise(
         A = (H / np.outer(size, size) + damping * np.eye(len(x)))[np.ix_(free, free)]
         step = np.zeros_like(x)
         step[free] = -np.linalg.solve(A, g[free] / size[free]) / size[free]
-        step = np.clip(x + step, low, high) - x
+        step = np.clip(x + step / max(1.0, np.max(np.abs(step)) / STEP), low, high) - x
         promised = -(2 * g @ step + step @ H @ step)
-        if promised <= tolerance * cost and damping < 1e-2:
+        if promised <= tolerance * cost and damping < 1e-2 and np.max(np.abs(step)) < SMALL:
             return _Minimum(at(x + step), max(cost - max(promised, 0.0), 0.0), H)
         trial = criterion.normal(at(x + step), lin, fitted)
         gain = (cost - trial[0]) / promised if promised > 0 else -1.0

@@ -261,7 +261,7 @@ def make_plan(
     gravity = np.zeros(robot.n) if gravity_torque is None else np.abs(gravity_torque)
     headroom = np.maximum(TORQUE_SHARE * robot.array("torque_limit") - gravity, 0.1 * robot.array("torque_limit"))
     amplitudes = shape_amplitudes(robot, excitation.frequency, inertia, injection, headroom)
-    experiments = []
+    planned = []
     for i, q0 in enumerate(postures):
         held_out = i >= len(postures) - validation_points
         role = "validation" if held_out else "identification"
@@ -269,11 +269,11 @@ def make_plan(
             r = orthogonal_multisines(rng, lines, amplitudes, period)
             for level in _levels_at(i, levels, levels_per_point) if not held_out else (levels[0],):
                 for e in range(count):
-                    experiments.append(
+                    planned.append(
                         Experiment(f"op{i + 1:02d}", np.asarray(q0, float), e + 1, m + 1, level, role, level * r[e])
                     )
     moves = (_validation_motion(robot, postures, rng, sample_rate),) if trajectory else ()
-    return Plan(robot, excitation, tuple(experiments), moves, injection, seed)
+    return Plan(robot, excitation, tuple(planned), moves, injection, seed)
 
 
 def _levels_at(point: int, levels: tuple[float, ...], count: int | None) -> tuple[float, ...]:
