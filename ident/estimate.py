@@ -19,6 +19,7 @@ from robot_assets.errors import DataError
 
 ESTIMATORS = ("nls", "wnls", "lls", "wlls")
 LOG_SNR = 3.0  # entries below this ratio of size to deviation are left out of log criteria
+SEARCH_SNR = 10.0  # the same in the search, where weak entries drive weak springs out of reach; half of all stay in
 UNDETERMINED = 0.2  # relative standard deviation
 UNSEEN = 1e4
 ROUNDS = 3  # linearisations anew at the equilibrium of the last estimate
@@ -73,7 +74,7 @@ def fit_frf(
 ) -> Estimate:
     """Fit log-parameters to the FRFs of all operating points.
 
-    A search by LLS from every start comes first, then the wanted criterion from the best of them.
+    A search by LLS from every start comes first, then the wanted criterion from the best of the ends by it.
 
     Args:
         nominal: starting guesses, and centre of the starts drawn where none are given.
@@ -96,10 +97,12 @@ def fit_frf(
     if stray:
         raise DataError("fitted", "fit_frf", stray[0], f"of {names}")
     free = np.array([fitted is None or name in fitted for name in names])
-    search = _Criterion.of(structure, frf, sample_time, hold, "lls")
+    search = _Criterion.of(structure, frf, sample_time, hold, "lls", SEARCH_SNR)
     found = [_minimise(search, p, free, SEARCH) for p in (tuple(starts) if starts else _starts(nominal, seed))]
-    best = min(found, key=lambda f: f.cost).parameters
-    criterion = search if estimator == "lls" else _Criterion.of(structure, frf, sample_time, hold, estimator)
+    criterion = _Criterion.of(structure, frf, sample_time, hold, estimator)
+    ends = [f.parameters for f in found]
+    # LLS hardly sees weak springs: an end that it likes may be far off by the wanted criterion.
+    best = min(ends, key=lambda p: criterion.normal(p, criterion.linearised(p), free)[0]) if len(ends) > 1 else ends[0]
     for _ in range(ROUNDS):
         last, result = best.to_log(), _minimise(criterion, best, free, FINAL)
         best = result.parameters
@@ -163,8 +166,10 @@ class _Criterion:
     Lambda: np.ndarray
 
     @classmethod
-    def of(cls, structure: Structure, frf: FRF, sample_time: float, hold: str, estimator: str) -> _Criterion:
-        """The criterion of one of ``ESTIMATORS``."""
+    def of(
+        cls, structure: Structure, frf: FRF, sample_time: float, hold: str, estimator: str, snr: float = LOG_SNR
+    ) -> _Criterion:
+        """The criterion of one of ``ESTIMATORS``; log criteria without the entries below ``snr``."""
         Q, F, n, _ = frf.G.shape
         g = np.swapaxes(frf.G, -1, -2).reshape(Q * F, n * n)
         Lambda = frf.covariance.reshape(Q * F, n * n, n * n)
@@ -172,7 +177,9 @@ class _Criterion:
         std = np.sqrt(Lambda[:, k, k].real)
         mask = np.ones(g.shape, bool)
         if estimator in ("lls", "wlls"):
-            mask = np.abs(g) > LOG_SNR * std
+            size = np.abs(g)
+            median = np.median(size / np.maximum(std, 1e-300))
+            mask = size > max(LOG_SNR, min(snr, median)) * std
             scale = 1.0 / np.where(mask, g, 1.0)
             Lambda = scale[:, :, None] * Lambda * scale.conj()[:, None, :]
         if not mask.all():
