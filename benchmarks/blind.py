@@ -30,7 +30,7 @@ from sim.experiment import draw_drives
 from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
 
 ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "hardening_stiffness", "payload")
-SIZES = {"smoke": 6, "quick": 26, "full": 120}
+SIZES = {"smoke": 6, "quick": 26, "sixty": 60, "full": 400}
 
 
 @dataclass(frozen=True)

@@ -207,12 +207,60 @@ def attribute_once(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> Round:
-    """One round: screen all, refit the best, weigh them."""
+    """One round: screen all, refit the best, weigh them.
+
+    Of a strong discrepancy candidates are sought on two ways, from the softened model and from the
+    model as it stands: a cause may have spoilt either. All are compared under the same weights.
+    """
     stage, level = soften(problem, current)
+    found, scores = explore(problem, stage, hypotheses, level > 0, progress)
+    before = current
+    if level > 0:
+        preds = predictions(problem, stage)
+        sharp = make_weights(problem, preds, 0.0)
+        before = replace(current, cost=cost_under(problem, current, sharp), weights=sharp)
+        ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
+        ways = [(h, r, (*ladder, sharp)) for h, r in found[:FINALISTS]]
+        if current.chi2_per_dof < HOPELESS:
+            direct, _ = explore(problem, current, hypotheses, True, progress)
+            ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
+        found = []
+        for h, result, steps in ways:
+            if progress is not None:
+                progress(f"finalist: {h.effect} at {h.place}")
+            for weights in steps:
+                result = refit(problem, result.model, weights, result.remainders) or result
+            if result.weights is sharp:
+                found.append((h, result))
+    best: dict[int, tuple[Hypothesis, Fit]] = {}
+    for h, result in found:
+        if id(h) not in best or result.cost < best[id(h)][1].cost:
+            best[id(h)] = h, result
+    if not best:
+        return Round(before, (), tuple(scores), 1.0)
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in best.values()], before.count)
+    scale = max(1.0, min(r.cost for _, r in best.values()) / before.count)
+    return Round(before, tuple(weighed), tuple(scores), scale)
+
+
+def explore(
+    problem: Problem,
+    stage: Fit,
+    hypotheses: Sequence[Hypothesis],
+    regardless: bool,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[list[tuple[Hypothesis, Fit]], list[Score]]:
+    """Candidates fitted under the weights of ``stage``, best first, and all scores.
+
+    Args:
+        regardless: refit also where no linear step explains much.
+    """
     preds = predictions(problem, stage)
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
-    chosen = choose(scores) if scores and scores[0].gain > WORTH_A_REFIT * excess else []
+    if not scores or not (regardless or scores[0].gain > WORTH_A_REFIT * excess):
+        return [], scores
+    chosen = with_gear_laws(problem, stage, preds, choose(scores), scores)
     found = []
     for i, score in enumerate(chosen):
         h = score.hypothesis
@@ -223,28 +271,9 @@ def attribute_once(
         if result is not None:
             found.append((h, result))
     found = [
-        (h, result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result)
-        for h, result in hopeful(found)
+        (h, r if r.converged else refit(problem, r.model, stage.weights, r.remainders) or r) for h, r in hopeful(found)
     ]
-    before = current
-    if level > 0:
-        sharp = make_weights(problem, preds, 0.0)
-        before = replace(current, cost=cost_under(problem, current, sharp), weights=sharp)
-        steps = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
-        finalists = sorted(found, key=lambda x: x[1].cost)[:FINALISTS]
-        found = []
-        for h, result in finalists:
-            if progress is not None:
-                progress(f"finalist: {h.effect} at {h.place}")
-            for weights in (*steps, sharp):
-                result = refit(problem, result.model, weights, result.remainders) or result
-            if result.weights is sharp:
-                found.append((h, result))
-    if not found:
-        return Round(before, (), tuple(scores), 1.0)
-    weighed = weigh([Candidate(h, result, 0.0) for h, result in found], before.count)
-    scale = max(1.0, min(r.cost for _, r in found) / before.count)
-    return Round(before, tuple(weighed), tuple(scores), scale)
+    return sorted(found, key=lambda x: x[1].cost), scores
 
 
 def predictions(problem: Problem, result: Fit) -> list[Prediction]:
@@ -303,6 +332,32 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     return out
 
 
+def with_gear_laws(
+    problem: Problem, stage: Fit, preds: Sequence[Prediction], chosen: list[Score], scores: Sequence[Score]
+) -> list[Score]:
+    """Candidates, and the laws of the gear at the joint that carries most of the discrepancy.
+
+    A gear that stiffens or softens moves its resonance with the amplitude; the linear step of a
+    score says little about that, so these laws are fitted from a size of their own.
+    """
+    excess = np.zeros(problem.structure.n)
+    for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
+        e = stage.weights.apply(g, residual(group, pred))
+        excess += np.sum(e**2 - 1.0, axis=(0, 1, 2))
+    loudest = int(np.argmax(excess))
+    have = {s.hypothesis.key for s in chosen}
+    deflection = np.sqrt(
+        np.mean([np.mean(p.motion(g).delta(loudest) ** 2) for g, p in zip(problem.groups, preds, strict=True)])
+    )
+    stiffness = float(stage.model.par.stiffness[loudest])
+    extra = []
+    for score in scores:
+        h = score.hypothesis
+        if h.joint == loudest and h.key not in have and "size" in h.options:
+            extra.append(replace(score, start=h.options["size"](stiffness, deflection)))
+    return [*chosen, *extra]
+
+
 def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:
     """Effects with the hypothesis of a score, which takes the place of a special case of its own."""
     h = score.hypothesis
@@ -329,7 +384,7 @@ def weigh(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
     """
     cost = np.array([c.fit.cost for c in candidates])
     excess = max(cost.min() - count, 0.0)
-    complexity = np.array([sum(not q.nuisance for q in c.hypothesis.parameters) for c in candidates])
+    complexity = np.array([len(c.hypothesis.parameters) for c in candidates])
     decoy = np.array([c.hypothesis.decoy for c in candidates], float)
     evidence = -0.5 * (cost - cost.min()) / (TEMPER + MODEL_ERROR_SHARE / 6.0 * excess)
     evidence = evidence - NATS_PER_PARAMETER * complexity - DECOY_NATS * decoy

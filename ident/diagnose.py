@@ -133,13 +133,16 @@ def diagnose_fully(
         gain = measure_gain(
             errors, dataset.joints, affected, "validation segments", np.random.default_rng(SEED)
         )
-        shown = setup.held_out
+        shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
     else:
         gain = leave_one_out(setup, result, affected)
         shown = problem.groups[:1]
         pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
     say("evidence")
-    last = [predict(after, g, problem.sampling) for g in problem.groups]
+    last = [
+        predict(after, g, problem.sampling, W=W, steps=0)
+        for g, W in zip(problem.groups, result.final.remainders, strict=True)
+    ]
     verdict = make_verdict(dataset, setup, result, gain, first, last)
     kept = result.rounds if len(verdict.causes) else ()
     return Diagnosis(

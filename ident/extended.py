@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+import scipy.fft
 
 from ident.graybox import Parameters, Structure, damping_diagonal, impedance, stiffness_diagonal
 from ident.hypotheses import kernels
@@ -25,7 +26,9 @@ from ident.inverse import (
 )
 from ident.records import NOISE_LINES, Group, mean_over_lines
 
-LOOP_REFINEMENT = 2  # time grid of a gear's loop, in multiples of that of other laws
+REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
+LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of other laws, at least
+LOOP_STEP = 0.25  # its step, at most, over the time scale of the fastest mode
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,8 @@ def predict_at(
         Q[..., j] += effect.hypothesis.law(effect.p, Motion(group, bare, par), j, par.stiffness[j])
     inner = by_channel.get("link", []) + by_channel.get("spring", [])
     react = partial(_inner_torques, structure, par, plane, group, effects=inner) if inner else None
-    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, react=react, steps=steps)
+    passes = 1 if len(inner) == 1 and _closes_itself(inner[0]) else REACTION_STEPS
+    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, react=react, passes=passes, steps=steps)
     U = solution.U
     motor = by_channel.get("motor", [])
     if motor:
@@ -199,51 +203,73 @@ def _inner_torques(
     that gear, the torques of all others held.
     """
     S, L, n = solution.Q.shape
-    spring = np.zeros((S, L, n), complex)
-    link = np.zeros((S, L, structure.n_coordinates), complex)
     motor = np.zeros((S, L, n), complex)
-    spring += solution.torques.spring
-    link += solution.torques.link
     motion = Motion(group, solution, par)
-    per_joint: dict[int, np.ndarray] = {}
+    at_gear: dict[int, np.ndarray] = {}
+    at_link: dict[int, np.ndarray] = {}
+    loops = []
     for effect in effects:
         h, j = effect.hypothesis, effect.hypothesis.joint
-        if h.channel == "link":
-            column = structure.driven[j]
-            per_joint[1000 + j] = per_joint.get(1000 + j, 0.0) + motion.lines(
-                h.law(effect.p, _link_view(motion, j, column), j, par.stiffness[j])
-            )
+        if _closes_itself(effect):
+            loops.append(effect)
         elif h.options.get("kinematic"):
             error, torque = h.law(effect.p, motion, j, par.stiffness[j])
-            per_joint[j] = per_joint.get(j, 0.0) + plane.C[:, j] * motion.lines(error)
+            at_gear[j] = at_gear.get(j, 0.0) + plane.C[:, j] * motion.lines(error)
             motor[..., j] += motion.lines(torque)
-    for effect in effects:
-        h, j = effect.hypothesis, effect.hypothesis.joint
-        if h.channel == "spring" and not h.options.get("kinematic"):
-            compliance = plane.A_inv[:, structure.driven[j], structure.driven[j]]
-            linear = solution.delta[..., j] + compliance * (spring[..., j] - per_joint.get(j, 0.0))
-            per_joint[j] = per_joint.get(j, 0.0) + _spring_loop(structure, par, plane, group, effect, linear)
-    for j, value in per_joint.items():
-        if j >= 1000:
-            link[..., structure.driven[j - 1000]] = value
         else:
-            spring[..., j] = value
-    return Torques(spring=spring, link=link, motor=motor)
+            view = _link_view(motion, j, structure.driven[j])
+            at_link[j] = at_link.get(j, 0.0) + motion.lines(h.law(effect.p, view, j, par.stiffness[j]))
+    old_gear = solution.torques.spring + np.zeros((S, L, n), complex)
+    old_link = solution.torques.link + np.zeros((S, L, structure.n_coordinates), complex)
+    for effect in loops:
+        j, c = effect.hypothesis.joint, structure.driven[effect.hypothesis.joint]
+        compliance = plane.A_inv[:, c, c]
+        grid, modes = _modes(structure, par, plane, group, c)
+        if effect.hypothesis.channel == "link":
+            free = solution.Q_a[..., c] + compliance * (old_link[..., c] - at_link.get(j, 0.0))
+            at_link[j] = at_link.get(j, 0.0) + _link_loop(effect, grid, free, modes)
+        else:
+            free = solution.delta[..., j] + compliance * (old_gear[..., j] - at_gear.get(j, 0.0))
+            at_gear[j] = at_gear.get(j, 0.0) + _spring_loop(effect, grid, free, modes, par.stiffness[j])
+    for j, value in at_gear.items():
+        old_gear[..., j] = value
+    for j, value in at_link.items():
+        old_link[..., structure.driven[j]] = value
+    return Torques(spring=old_gear, link=old_link, motor=motor)
+
+
+def _closes_itself(effect: Effect) -> bool:
+    """Whether an effect's loop is solved in one pass."""
+    h = effect.hypothesis
+    return not h.options.get("kinematic") and (h.channel == "spring" or "loop" in h.options)
+
+
+def _modes(
+    structure: Structure, par: Parameters, plane: Plane, group: Group, column: int
+) -> tuple[Group, tuple[np.ndarray, ...]]:
+    """Time grid of a loop at a link coordinate, fine enough for the fastest mode, and the modes there."""
+    D = np.diag(damping_diagonal(structure, par))
+    K = np.diag(stiffness_diagonal(structure, par)) + plane.lin.Kg
+    fastest = np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(plane.lin.M, K))).max())
+    points = max(LOOP_REFINEMENT * group.n_time, int(group.period_time * fastest / LOOP_STEP))
+    grid = replace(group, n_time=scipy.fft.next_fast_len(points, real=True))
+    return grid, kernels.modal_compliance(plane.lin.M, D, K, int(column), group.period_time / grid.n_time)
 
 
 def _spring_loop(
-    structure: Structure, par: Parameters, plane: Plane, group: Group, effect: Effect, linear: np.ndarray
+    effect: Effect, grid: Group, free: np.ndarray, modes: tuple[np.ndarray, ...], stiffness: float
 ) -> np.ndarray:
     """Spectrum (S, L) of the torque of a gear's law, in steady state with the arm."""
-    j = effect.hypothesis.joint
-    group = replace(group, n_time=LOOP_REFINEMENT * group.n_time)
-    code, a, b, k = effect.hypothesis.law(effect.p, None, par.stiffness[j])
-    D = np.diag(damping_diagonal(structure, par))
-    K = np.diag(stiffness_diagonal(structure, par)) + plane.lin.Kg
-    dt = group.period_time / group.n_time
-    modes = kernels.modal_compliance(plane.lin.M, D, K, int(structure.driven[j]), dt)
-    torque = kernels.spring_loop(code, a, b, k, group.to_time(linear[..., None])[..., 0], *modes)
-    return group.to_lines(torque[..., None])[..., 0]
+    code, a, b, k = effect.hypothesis.law(effect.p, None, stiffness)
+    torque = kernels.spring_loop(code, a, b, k, grid.to_time(free[..., None])[..., 0], *modes[1:])
+    return grid.to_lines(torque[..., None])[..., 0]
+
+
+def _link_loop(effect: Effect, grid: Group, free: np.ndarray, modes: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Spectrum (S, L) of a torque with friction on a link, in steady state with the arm."""
+    q, v = (grid.to_time(x[..., None])[..., 0] for x in (free, 1j * grid.omega * free))
+    torque = kernels.link_loop(*effect.hypothesis.options["loop"](effect.p), q, v, *modes)
+    return grid.to_lines(torque[..., None])[..., 0]
 
 
 def _link_view(motion: Motion, joint: int, column: int) -> Motion:

@@ -29,13 +29,20 @@ class Errors:
 def segment_errors(
     problem: Problem, groups: Sequence[Group], before: Model, after: Model
 ) -> tuple[Errors, list[tuple[Prediction, Prediction]]]:
-    """Prediction errors in the compared band, before and after, and the noise in it."""
+    """Prediction errors in the compared band, before and after, and the noise in it.
+
+    Along a motion too large for a model its links cannot be solved; such a group is left out of the
+    errors of both models, and of the pairs of predictions.
+    """
     names: list[str] = []
     out: list[list[np.ndarray]] = [[], [], []]
     pairs = []
     for group in groups:
-        a = predict(before, group, problem.sampling)
-        b = predict(after, group, problem.sampling)
+        try:
+            a = predict(before, group, problem.sampling)
+            b = predict(after, group, problem.sampling)
+        except FloatingPointError:
+            continue
         pairs.append((a, b))
         S = noise_covariance(problem, group, b)
         share = 1.0 if group.window is None else float(np.mean(group.window**2))
@@ -45,7 +52,8 @@ def segment_errors(
             e = group.observe(group.U - pred.U)
             store.append(_power(np.abs(e) ** 2) / share)
         out[2].append(np.repeat(_power(noise[None]) / share, len(group.segments), axis=0))
-    return Errors(tuple(names), *(np.concatenate(x) for x in out)), pairs
+    joined = (np.concatenate(x) if x else np.zeros((0, len(problem.nominal.stiffness))) for x in out)
+    return Errors(tuple(names), *joined), pairs
 
 
 def _power(lines: np.ndarray) -> np.ndarray:
@@ -55,16 +63,18 @@ def _power(lines: np.ndarray) -> np.ndarray:
 
 def measure_gain(
     errors: Errors, joints: tuple[str, ...], affected: Sequence[int], method: str, rng: np.random.Generator
-) -> Gain:
+) -> Gain | None:
     """Rms errors, share of the gap to the noise floor that is closed, and its 95 % interval.
 
-    The interval is a percentile bootstrap over segments.
+    The interval is a percentile bootstrap over segments. None where no segment could be predicted.
 
     Args:
         affected: the joints over which errors are taken: those that carry the discrepancy in the
             identification data (all where there is none), so that the noise of a large joint does
             not hide what is gained at a small one.
     """
+    if not errors.segments:
+        return None
     pick_joints = list(affected) if len(affected) else list(range(len(joints)))
     n = len(pick_joints)
     errors = Errors(

@@ -37,7 +37,6 @@ REMAINDER_STEPS = 60  # fixed-point steps at most for the geometric remainder fr
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
 MEMORY = 6  # past iterates that are mixed
 REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
-REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 REACTION_CHANGE = 1e-5  # relative change that ends them
 
 
@@ -234,6 +233,7 @@ def solve(
     W: np.ndarray | None = None,
     torques: Torques = Torques(),
     react: Callable[[Solution], Torques] | None = None,
+    passes: int = 1,
     steps: int = 0,
 ) -> Solution:
     """Recorded motor torque that the model predicts along the measured motion.
@@ -244,6 +244,7 @@ def solve(
         torques: what effects add, at the start where they depend on the motion.
         react: torques that go with a solution; the result is consistent with them. None holds
             ``torques``.
+        passes: of ``react`` at most until they do; one where it is exact by itself.
         steps: fixed-point steps on the remainder.
     """
     if Q is None:
@@ -251,15 +252,17 @@ def solve(
     if W is None:
         W = static_remainder(structure, par, plane, group)
     if react is not None:
-        torques = _settle(structure, par, plane, Q, W, torques, react)
+        torques = _settle(structure, par, plane, Q, W, torques, react, passes)
     past: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(steps):
         Q_a = link_motion(structure, par, plane, Q, W, torques)
         change = geometric_remainder(structure, plane, group, Q_a) - W
+        if not np.all(np.isfinite(change)):
+            raise FloatingPointError("the motion of the links cannot be solved")
         past = [*past[-MEMORY:], (W, change)]
         W = _accelerated(past)
         if react is not None:
-            torques = _settle(structure, par, plane, Q, W, torques, react)
+            torques = _settle(structure, par, plane, Q, W, torques, react, passes)
         if np.abs(change).max() < REMAINDER_CHANGE * np.abs(W).max():
             break
     return _solution(structure, par, plane, Q, W, torques)
@@ -295,10 +298,11 @@ def _settle(
     W: np.ndarray,
     torques: Torques,
     react: Callable[[Solution], Torques],
+    passes: int,
 ) -> Torques:
     """Torques that are consistent with the motion that they cause, the remainder held."""
     last = np.inf
-    for _ in range(REACTION_STEPS):
+    for _ in range(passes):
         new = react(_solution(structure, par, plane, Q, W, torques))
         change = sum(float(np.sum(np.abs(np.asarray(x) - y) ** 2)) for x, y in _pairs(new, torques))
         size = sum(float(np.sum(np.abs(x) ** 2)) for x, _ in _pairs(new, torques))

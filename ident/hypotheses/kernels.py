@@ -26,7 +26,7 @@ def bristle(v: np.ndarray, dt: float, length: float) -> np.ndarray:
     out = np.empty((S, T))
     for i in range(S):
         z = 0.0
-        for sweep in range(2):
+        for _ in range(2):
             for k in range(T):
                 path = 0.5 * (v[i, k] + v[i, k - 1]) * dt / length
                 decay = np.exp(-abs(path))
@@ -42,7 +42,7 @@ def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
     out = np.empty((S, T))
     for i in range(S):
         h = 0.0
-        for sweep in range(2):
+        for _ in range(2):
             for k in range(T):
                 h = h + stiffness * (x[i, k] - x[i, k - 1])
                 h = min(max(h, -limit), limit)
@@ -69,6 +69,130 @@ def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: floa
             return -(a - k) * b
         return (a - k) * x
     return min(max(h_old + a * (x - x_old), -b), b)
+
+
+@njit(cache=True)
+def spring_point(
+    code: int, a: float, b: float, k: float, free: float, direct: float, x_old: float, h_old: float
+) -> float:
+    """Deflection ``x`` that solves ``x + direct h(x) = free``: a rising function of ``x``."""
+    if code == 0:
+        x = x_old
+        for _ in range(60):
+            step = (x + direct * a * x * x * x - free) / (1.0 + 3.0 * direct * a * x * x)
+            x -= step
+            if abs(step) <= 1e-12 * abs(x) + 1e-18:
+                break
+        return x
+    if code == 3:
+        x = (free - direct * (h_old - a * x_old)) / (1.0 + direct * a)
+        h = h_old + a * (x - x_old)
+        if h > b:
+            return free - direct * b
+        if h < -b:
+            return free + direct * b
+        return x
+    half, slope = (0.5 * a, -k) if code == 1 else (b, a - k)
+    inner = max(1.0 + direct * slope, 1e-6)
+    x = free / inner
+    if x > half:
+        return free - direct * slope * half
+    if x < -half:
+        return free + direct * slope * half
+    return x
+
+
+@njit(cache=True)
+def link_point(
+    stiffness: float, friction: float, turn: float, q: float, v: float, dq: float, dv: float, h: float
+) -> float:
+    """Torque that solves ``h = stiffness (q - dq h) + friction tanh((v - dv h) / turn)``.
+
+    The difference of both sides rises with ``h``: Newton's steps, halved where they leave the bracket.
+    """
+    slope = 1.0 + stiffness * dq
+    low, high = (stiffness * q - friction) / slope, (stiffness * q + friction) / slope
+    h = min(max(h, low), high)
+    for _ in range(60):
+        y = np.tanh((v - dv * h) / turn)
+        value = slope * h - stiffness * q - friction * y
+        if value > 0:
+            high = h
+        else:
+            low = h
+        new = h - value / (slope + friction * dv / turn * (1.0 - y * y))
+        if not low <= new <= high:
+            new = 0.5 * (low + high)
+        if abs(new - h) <= 1e-9 * friction:
+            return new
+        h = new
+    return h
+
+
+@njit(cache=True)
+def periodic_start(start: np.ndarray, end: np.ndarray, decay: np.ndarray, T: int) -> None:
+    """Replace ``start`` by the state that the torque of a period repeats; ``end`` as it left off."""
+    for m in range(len(start)):
+        whole = decay[m] ** T
+        start[m] = (end[m] - whole * start[m]) / (1.0 - whole)
+        end[m] = start[m]
+
+
+@njit(cache=True)
+def link_loop(
+    stiffness: float,
+    friction: float,
+    turn: float,
+    q: np.ndarray,
+    v: np.ndarray,
+    poles: np.ndarray,
+    decay: np.ndarray,
+    gain_old: np.ndarray,
+    gain_new: np.ndarray,
+) -> np.ndarray:
+    """Steady state of ``h = stiffness q + friction tanh(v / turn)`` on a link; (S, T) torque.
+
+    ``h`` moves the link back through the compliance of ``modal_compliance``, whose velocity is that
+    of its modes (residues add up to zero: a torque does not step a velocity).
+
+    Args:
+        q, v: (S, T) link position and velocity without ``h``, rad, rad/s.
+        poles, decay, gain_old, gain_new: (modes,) complex.
+    """
+    S, T = q.shape
+    modes = len(poles)
+    out = np.zeros((S, T))
+    dq = 0.0
+    dv = 0.0
+    for m in range(modes):
+        dq += gain_new[m].real
+        dv += (poles[m] * gain_new[m]).real
+    x = np.zeros(modes, np.complex128)
+    start = np.zeros(modes, np.complex128)
+    for i in range(S):
+        x[:] = 0.0
+        start[:] = 0.0
+        h = stiffness * q[i, T - 1] + friction * np.tanh(v[i, T - 1] / turn)
+        for sweep in range(SWEEPS):
+            change = 0.0
+            largest = 0.0
+            for t in range(T):
+                free_q = q[i, t]
+                free_v = v[i, t]
+                for m in range(modes):
+                    x[m] = decay[m] * x[m] + gain_old[m] * h
+                    free_q -= x[m].real
+                    free_v -= (poles[m] * x[m]).real
+                h = link_point(stiffness, friction, turn, free_q, free_v, dq, dv, h)
+                for m in range(modes):
+                    x[m] += gain_new[m] * h
+                change = max(change, abs(h - out[i, t]))
+                largest = max(largest, abs(h))
+                out[i, t] = h
+            if sweep > 0 and change <= 1e-5 * largest:
+                break
+            periodic_start(start, x, decay, T)
+    return out
 
 
 @njit(cache=True)
@@ -99,8 +223,10 @@ def spring_loop(
     for m in range(modes):
         direct += gain_new[m].real
     x = np.zeros(modes, np.complex128)
+    start = np.zeros(modes, np.complex128)
     for i in range(S):
         x[:] = 0.0
+        start[:] = 0.0
         h = spring_torque(code, a, b, k, linear[i, T - 1], linear[i, T - 1], 0.0)
         delta = linear[i, T - 1]
         for sweep in range(SWEEPS):
@@ -111,11 +237,8 @@ def spring_loop(
                 for m in range(modes):
                     x[m] = decay[m] * x[m] + gain_old[m] * h
                     free -= x[m].real
-                guess = free - direct * h
-                h_new = h
-                for it in range(4):
-                    h_new = spring_torque(code, a, b, k, guess, delta, h)
-                    guess = free - direct * h_new
+                guess = spring_point(code, a, b, k, free, direct, delta, h)
+                h_new = spring_torque(code, a, b, k, guess, delta, h)
                 for m in range(modes):
                     x[m] += gain_new[m] * h_new
                 delta = guess
@@ -125,13 +248,14 @@ def spring_loop(
                 out[i, t] = h
             if sweep > 0 and change <= 1e-5 * largest:
                 break
+            periodic_start(start, x, decay, T)
     return out
 
 
 def modal_compliance(
     M: np.ndarray, D: np.ndarray, K: np.ndarray, column: int, dt: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Modes of ``[(s^2 M + s D + K)^{-1}]_{cc}`` for ``spring_loop``: decay, gain_old, gain_new.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Modes of ``[(s^2 M + s D + K)^{-1}]_{cc}``: poles, decay, gain_old, gain_new.
 
     Conjugate pairs are folded into one mode of twice the residue; a first-order hold over ``dt``.
     """
@@ -150,4 +274,4 @@ def modal_compliance(
     decay = np.exp(z)
     phi1 = np.expm1(z) / z
     phi2 = (phi1 - 1.0) / z
-    return decay, residue * dt * (phi1 - phi2), residue * dt * phi2
+    return poles, decay, residue * dt * (phi1 - phi2), residue * dt * phi2

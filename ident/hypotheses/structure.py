@@ -18,7 +18,7 @@ from ident.graybox import (
     impedance,
     linearise,
 )
-from ident.hypotheses.friction import direction
+from ident.hypotheses.friction import SMOOTHING, direction
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.inverse import (
     Motion,
@@ -108,10 +108,13 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
     """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        def start(c):
-            return np.array([max(c[0], 1e-3), c[1]]) if c[1] > 0 else None
+        v = motion.v_link(j)
+        turn = 0.02 * float(np.sqrt(np.mean(v**2)))
 
-        return Screen((motion.q_link(j), direction(motion.v_link(j))), start)
+        def start(c):
+            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), turn]) if max(c[0], c[1]) > 0 else None
+
+        return Screen((motion.q_link(j), direction(v, turn)), start)
 
     return Hypothesis(
         "dress_pack",
@@ -121,12 +124,14 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
         (
             Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True, step=1e-3),
             Parameter("friction", "N m", 1e-9, 1e7, log=True, step=1e-3),
+            SMOOTHING,
         ),
-        lambda p, motion, j, k: p[0] * motion.q_link(j) + p[1] * direction(motion.v_link(j)),
+        None,
         lambda scale: [()],
         screen,
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
+        options={"loop": lambda p: (p[0], p[1], p[2])},
     )
 
 

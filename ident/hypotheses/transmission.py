@@ -37,6 +37,7 @@ def hardening_stiffness(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} stiffens with its deflection (cubic term {cubic:.3g} N m/rad3): the resonance"
         " climbs with amplitude and with gravity load.",
         variable="delta",
+        options={"size": lambda k, delta: np.array([0.3 * k / delta**2])},
     )
 
 
@@ -61,6 +62,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} has a dead band of {gap:.3g} rad: its resonance drops at small amplitude wherever"
         " gravity does not preload it.",
         variable="delta",
+        options={"size": lambda k, delta: np.array([0.5 * delta])},
     )
 
 
@@ -90,6 +92,7 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} is soft about zero torque ({low_stiffness:.3g} N m/rad within"
         " {transition:.3g} rad): its resonance falls where it carries little.",
         variable="delta",
+        options={"size": lambda k, delta: np.array([0.5 * k, 0.5 * delta])},
     )
 
 
