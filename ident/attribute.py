@@ -314,7 +314,7 @@ def refit(
             weights=weights,
             remainders=remainders,
         )
-    except (np.linalg.LinAlgError, ValueError, RuntimeError):
+    except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError):
         return None
 
 

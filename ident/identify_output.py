@@ -32,7 +32,7 @@ def identify_and_write(
         DataError: for an estimator that there is not, or data without full FRFs.
     """
     if estimator == "ml":
-        setup, result = identify(dataset, progress=progress)
+        _, result = identify(dataset, progress=progress)
         values, undetermined = baseline_values(result)
         parameters = {k: asdict(v) for k, v in values.items()}
         names, covariance = list(result.names), result.covariance()

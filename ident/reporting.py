@@ -150,11 +150,11 @@ def evidence_plot(problem: Problem, fit: Fit, predictions: Sequence[Prediction],
             X[:, band] = 0.0
             curves.append(group.to_time(X)[..., 0])
         variable = {
-            "v": lambda m=motion: m.v(j),
-            "q": lambda m=motion: m.q(j),
-            "delta": lambda m=motion: m.delta(j),
+            "v": lambda m=motion, j=j: m.v(j),
+            "q": lambda m=motion, j=j: m.q(j),
+            "delta": lambda m=motion, j=j: m.delta(j),
             "time": lambda m=motion: m.time,
-            "torque": lambda m=motion: m.torque(j),
+            "torque": lambda m=motion, j=j: m.torque(j),
         }.get(h.variable, lambda c=curves: c[1])()
         step = max(1, variable.size // (1500 // max(len(problem.groups), 1) + 1))
         xs.append(variable.ravel()[::step])

@@ -49,7 +49,7 @@ class Problem:
     free_timing: bool = True
 
     def samples(self, group: Group) -> int:
-        return int(round(group.period_time / self.sampling.sample_time))
+        return round(group.period_time / self.sampling.sample_time)
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ def run_loop(
     """
     S, n = len(qpos), plant.robot.n
     h = plant.model.opt.timestep
-    substeps = int(round(1 / (sample_rate * h)))
+    substeps = round(1 / (sample_rate * h))
     batch = Batch(plant.model, S, nthread=2)
     x, v, force = batch.bind("qpos"), batch.bind("qvel"), batch.bind("qfrc_applied")
     x[:] = qpos
@@ -92,7 +92,7 @@ def run_loop(
     ff = controller.feed_forward
     for k in range(samples):
         show = {"q": x[:, m].copy(), "q_link": x[:, a].copy()}
-        for j, channel, late, step in measure:
+        for j, channel, late, _ in measure:
             if not late:
                 show[channel][:, j] = seen[channel][:, j] if k else show[channel][:, j]
         y = show["q"] + noise.q * rng.standard_normal((S, n))

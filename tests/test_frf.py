@@ -70,7 +70,7 @@ def test_distortion_shows_in_the_total_but_not_in_the_noise():
     """A disturbance that repeats in every period: only realizations tell (theory.md 3.1)."""
     rng = np.random.default_rng(4)
     G, blocks = closed_loop(rng, 0.001, M=6, P=3)
-    M, P, F, n, _ = blocks.U.shape
+    M, _P, F, n, _ = blocks.U.shape
     e = 0.05 * (rng.normal(size=(M, 1, F, n, n)) + 1j * rng.normal(size=(M, 1, F, n, n))) / np.sqrt(2)
     blocks = Blocks(blocks.U, blocks.Y + e, blocks.R)
     estimate = average(blocks, "ari")
