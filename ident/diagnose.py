@@ -8,11 +8,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.attribute import Attribution, Candidate, attribute, fit_baseline
+from ident.attribute import Attribution, Candidate, Round, attribute, fit_baseline
 from ident.dataset import Dataset
 from ident.extended import Effect, Prediction, predict
 from ident.gain import measure_gain, segment_errors
-from ident.graybox import Parameters, build_structure, parameter_names, parameter_unit
+from ident.graybox import (
+    Parameters,
+    Structure,
+    build_structure,
+    equilibrium,
+    linearise,
+    parameter_names,
+    parameter_unit,
+    stiffness_diagonal,
+)
 from ident.inverse import Sampling
 from ident.noise import sample_noise
 from ident.records import Group, build_groups, difference_noise
@@ -20,8 +29,12 @@ from ident.reporting import affected_joints, describe, evidence_plot, frf_views,
 from ident.torque_fit import Fit, Problem, fit
 from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict
 
+MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
+MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
+POSTURES = 8  # of a motion at which modes are looked at
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
+LEFT_ERROR = 3.0  # the same above which an unknown cause remains however strong the named ones are
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 SEED = 0
 
@@ -42,15 +55,16 @@ def set_up(dataset: Dataset) -> Setup:
         DataError: where nothing is left for identification.
     """
     robot = dataset.robot
-    groups = build_groups(dataset)
+    nominal, structure = Parameters.nominal(robot), build_structure(robot)
+    band = motion_band_hz(dataset, structure, nominal)
+    groups = build_groups(dataset, motion_band_hz=band)
     multisines = tuple(g for g in groups if g.window is None)
     held_out = ()
     if any(s.role == "validation" for s in dataset.segments):
-        held_out = build_groups(dataset, role="validation")
+        held_out = build_groups(dataset, role="validation", motion_band_hz=band)
     q_std, tau_std = _noise(dataset)
-    nominal = Parameters.nominal(robot)
     problem = Problem(
-        build_structure(robot),
+        structure,
         multisines or groups,
         Sampling(1.0 / dataset.sample_rate, dataset.input_hold),
         nominal,
@@ -58,6 +72,24 @@ def set_up(dataset: Dataset) -> Setup:
         q_std,
     )
     return Setup(problem, held_out, parameter_names(robot))
+
+
+def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) -> float:
+    """Highest compared frequency of motions, Hz: below the modes of the links on standing motors.
+
+    Near such a mode the torque depends on how the links swung before the record began, which no
+    record of the motors tells.
+    """
+    lowest = np.inf
+    for segment in dataset.segments:
+        if segment.kind != "trajectory":
+            continue
+        for q in segment.q[:: max(1, len(segment.q) // POSTURES)]:
+            lin = linearise(structure, equilibrium(structure, nominal, q))
+            K = np.diag(stiffness_diagonal(structure, nominal)) + lin.Kg
+            squares = np.linalg.eigvals(np.linalg.solve(lin.M, K)).real
+            lowest = min(lowest, *np.sqrt(squares[squares > 0]) / 2 / np.pi, np.inf)
+    return float(min(MOTION_BAND_HZ, dataset.sample_rate / 10, MOTION_SHARE * lowest))
 
 
 def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -204,15 +236,18 @@ def make_verdict(
     final = result.final
     left = result.left_share if result.detected else 0.0
     unknown = result.detected and (
-        result.unknown or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE) or not final.model.effects
+        result.unknown
+        or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)
+        or final.chi2_per_dof > LEFT_ERROR
+        or not final.model.effects
     )
     causes = []
     trust = known_probability(left, result.unknown) if result.detected else 1.0
     covariance = final.covariance()
-    competitors = {r.candidates[0].hypothesis.key: r.candidates for r in result.rounds}
+    rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
     for effect in final.model.effects:
-        candidates = competitors.get(effect.hypothesis.key, ())
-        causes.append(_cause(effect, candidates, final, covariance, trust))
+        found = rounds[effect.hypothesis.key]
+        causes.append(_cause(effect, found.candidates, final, covariance, trust * explained_share(found, final)))
     verdict = "unknown cause remains" if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)
     description = describe(setup.problem, final, last) if unknown else None
@@ -234,6 +269,16 @@ def make_verdict(
         unidentified=undetermined,
         residual_description=description,
     )
+
+
+def explained_share(found: Round, final: Fit) -> float:
+    """What a cause explains, over that and what is left at the end: 1 where nothing is left.
+
+    A cause that explains less than the unknown may be the unknown's own shadow.
+    """
+    fall = max(found.before.cost - found.candidates[0].fit.cost, 0.0)
+    left = max(final.chi2_per_dof - LEFT_NOISE, 0.0) * final.count
+    return fall / max(fall + left, 1e-300)
 
 
 def known_probability(left: float, decoy_won: bool) -> float:
