@@ -24,10 +24,11 @@ from ident.graybox import (
 )
 from ident.inverse import Sampling
 from ident.noise import sample_noise
+from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
 from ident.torque_fit import Fit, Problem, fit
-from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict
+from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict, Where
 
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
 MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
@@ -46,6 +47,7 @@ class Setup:
     problem: Problem
     held_out: tuple[Group, ...]
     names: tuple[str, ...]
+    steps: tuple[Steps, ...] = ()
 
 
 def set_up(dataset: Dataset) -> Setup:
@@ -63,6 +65,10 @@ def set_up(dataset: Dataset) -> Setup:
     if any(s.role == "validation" for s in dataset.segments):
         held_out = build_groups(dataset, role="validation", motion_band_hz=band)
     q_std, tau_std = _noise(dataset)
+    declared = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
+    steps = find_steps(dataset, declared) if np.all(declared > 0) else ()
+    step_std = np.zeros(robot.n)
+    step_std[[x.joint for x in steps]] = [x.resolution / np.sqrt(12.0) for x in steps]
     problem = Problem(
         structure,
         multisines or groups,
@@ -70,8 +76,9 @@ def set_up(dataset: Dataset) -> Setup:
         nominal,
         tau_std,
         q_std,
+        step_std=step_std,
     )
-    return Setup(problem, held_out, parameter_names(robot))
+    return Setup(problem, held_out, parameter_names(robot), steps)
 
 
 def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) -> float:
@@ -248,6 +255,10 @@ def make_verdict(
     for effect in final.model.effects:
         found = rounds[effect.hypothesis.key]
         causes.append(_cause(effect, found.candidates, final, covariance, trust * explained_share(found, final)))
+    causes += [_rounded(x, dataset.joints[x.joint]) for x in setup.steps]
+    detected = result.detected or bool(setup.steps)
+    seen = where(setup.problem, result.baseline, first) if result.detected else ()
+    seen += tuple(Where(dataset.joints[x.joint], "q", "position in steps", 1.0) for x in setup.steps if not seen)
     verdict = "unknown cause remains" if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)
     description = describe(setup.problem, final, last) if unknown else None
@@ -255,19 +266,31 @@ def make_verdict(
         dataset=dataset.name,
         baseline=values,
         discrepancy=Discrepancy(
-            result.detected,
-            result.p_value,
+            detected,
+            0.0 if setup.steps else result.p_value,
             result.baseline.chi2_per_dof,
-            where(setup.problem, result.baseline, first) if result.detected else (),
+            seen,
         ),
         causes=tuple(causes),
         unexplained_share=float(left),
         unexplained_verdict=verdict,
         gain=gain,
         next_experiment=next_experiment(causes, unknown),
-        sentence=sentence(causes, unknown, result.detected, gain),
+        sentence=sentence(causes, unknown, detected, gain),
         unidentified=undetermined,
         residual_description=description,
+    )
+
+
+def _rounded(steps: Steps, joint: str) -> Cause:
+    """The cause of a position that comes in steps: seen in the samples, not weighed against others."""
+    return Cause(
+        effect="encoder_quantization",
+        joint=joint,
+        parameters={"resolution": Value(steps.resolution, steps.std, "rad")},
+        probability=0.99,
+        evidence=f"The position of {joint} takes steps of {steps.resolution:.3g} rad: its samples lie on a grid.",
+        alternatives=(),
     )
 
 

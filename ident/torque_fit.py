@@ -16,7 +16,7 @@ import numpy as np
 from ident.extended import Effect, Model, Prediction, predict, predict_at
 from ident.graybox import Parameters, Structure
 from ident.inverse import Sampling, baseline_jacobian
-from ident.noise import residual_covariance
+from ident.noise import residual_covariance, white_covariance
 from ident.records import Group
 
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
@@ -38,6 +38,8 @@ class Problem:
         nominal: starting guesses, centre of the weak prior.
         tau_std, q_std: (n,) sample noise where single periods give no scatter.
         free_timing: whether a common timing offset is fitted.
+        step_std: (n,) rounding error of position in steps, rad; it repeats with the motion and does
+            not average out over periods.
     """
 
     structure: Structure
@@ -47,6 +49,7 @@ class Problem:
     tau_std: np.ndarray
     q_std: np.ndarray
     free_timing: bool = True
+    step_std: np.ndarray | float = 0.0
 
     def samples(self, group: Group) -> int:
         return round(group.period_time / self.sampling.sample_time)
@@ -113,6 +116,9 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
     k = np.arange(S.shape[1])
     S = S.copy()
     S[:, k, k] += prediction.law_noise(group)[group.keep]
+    if np.any(problem.step_std):
+        variance = np.broadcast_to(np.square(problem.step_std) / problem.samples(group), k.shape)
+        S += white_covariance(prediction.sampled_impedance[group.keep], 0.0 * variance, variance)
     return S
 
 

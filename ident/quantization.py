@@ -1,0 +1,95 @@
+"""Steps in a position channel, seen in its samples themselves.
+
+A resolution that is coarse against the noise leaves the samples on a grid, which spectra do not
+show: they hold its error as a floor at all lines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.dataset import Dataset
+
+COARSE = 1.5  # rounding error over the sample noise from which steps are an effect
+SAMPLES = 4000  # looked at per joint
+BACKGROUND = 0.15  # median of the same over other steps: positions that dwell raise it at many
+STRETCH = 400.0  # half the positions in which steps blurred by noise are looked for, in least steps
+ON_GRID = 0.02  # distance from the grid, in steps, of samples that lie on it
+LEAST_CELLS = 20  # steps that the motion must span
+CONTRAST = 0.35  # of the sum over samples of exp(2 pi j q / step), relative to its largest value
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Position of a joint in steps of ``resolution``, with standard deviation; rad."""
+
+    joint: int
+    resolution: float
+    std: float
+
+
+def find_steps(dataset: Dataset, q_std: np.ndarray) -> tuple[Steps, ...]:
+    """Joints whose motor position comes in steps that are coarse against its noise.
+
+    Args:
+        q_std: (n,) sample noise that the robot or the dataset declares, rad.
+    """
+    out = []
+    for j in range(dataset.n):
+        periodic = [s for s in dataset.segments if s.kind == "multisine"]
+        moving = max(periodic or dataset.segments, key=lambda s: float(np.ptp(s.q[:, j])))
+        q = moving.q[:: max(1, len(moving.q) // SAMPLES), j]
+        found = _exact_grid(q)
+        if found is None:
+            found = _blurred_grid(q, float(q_std[j])) if periodic else None
+        if found is not None and found[0] / np.sqrt(12.0) > COARSE * q_std[j]:
+            out.append(Steps(j, *found))
+    return tuple(out)
+
+
+def _exact_grid(q: np.ndarray) -> tuple[float, float] | None:
+    """Step and its deviation where every sample is a whole number of steps from the others."""
+    levels = np.unique(q)
+    if len(levels) < LEAST_CELLS or len(levels) > 0.7 * len(q):
+        return None
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > 1e-6 * np.median(gaps)]
+    step = float(np.min(gaps))
+    # Each longer gap tells the step better: the grid is followed from near to far.
+    for reach in np.geomspace(1.0, max(np.ptp(levels) / step, 1.0), 12):
+        near = gaps[gaps <= reach * step * 1.5]
+        step = float(np.sum(near) / max(np.sum(np.round(near / step)), 1.0))
+    cells = (levels - levels[0]) / step
+    off = np.abs(cells - np.round(cells))
+    if np.ptp(levels) < LEAST_CELLS * step or np.mean(off < ON_GRID) < 0.98:
+        return None
+    return step, float(step * max(np.sqrt(np.mean(off**2)), 1e-9) / np.ptp(cells))
+
+
+def _blurred_grid(q: np.ndarray, noise: float) -> tuple[float, float] | None:
+    """The same where noise was added after the rounding: clusters, by their characteristic function.
+
+    Looked for in a stretch of positions short enough to be crossed evenly.
+    """
+    least = COARSE * np.sqrt(12.0) * noise
+    near = q[np.abs(q - np.median(q)) < STRETCH * least][:SAMPLES]
+    return _clusters(near, least) if len(near) > LEAST_CELLS**2 else None
+
+
+def _clusters(q: np.ndarray, least: float) -> tuple[float, float] | None:
+    """Step of at least ``least`` about whose multiples the samples cluster, and its deviation."""
+    span = float(np.ptp(q))
+    low, high = LEAST_CELLS / max(span, 1e-300), 1.0 / least
+    if high <= low:
+        return None
+    wave = np.arange(low, high, 0.2 / span)
+    contrast = np.abs(np.exp(2j * np.pi * np.outer(wave, q)).mean(axis=1))
+    best = int(np.argmax(contrast))
+    if contrast[best] < CONTRAST or np.median(contrast) > BACKGROUND * contrast[best]:
+        return None
+    fine = wave[best] + np.linspace(-0.3, 0.3, 61) / span
+    value = np.abs(np.exp(2j * np.pi * np.outer(fine, q)).mean(axis=1))
+    step = 1.0 / float(fine[np.argmax(value)])
+    return step, step**2 * 0.02 / span
