@@ -69,9 +69,10 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
         s = direction(v, shape[0] * 0.02)
 
         def start(c):
-            if c[0] <= 0 or c[1] <= 0:
+            if c[0] + c[1] <= 0:
                 return None
-            return np.array([c[0], c[0] + c[1], shape[0], shape[0] * 0.02])
+            coulomb = max(c[0], 0.3 * (c[0] + c[1]))
+            return np.array([coulomb, max(c[0] + c[1], 1.3 * coulomb), shape[0], shape[0] * 0.02])
 
         return Screen((s, s * np.exp(-((v / shape[0]) ** 2))), start, shape)
 
