@@ -35,6 +35,7 @@ MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
+WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it
 LEFT_ERROR = 3.0  # the same above which an unknown cause remains however strong the named ones are
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 SEED = 0
@@ -247,9 +248,10 @@ def make_verdict(
         or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)
         or final.chi2_per_dof > LEFT_ERROR
         or not final.model.effects
+        or fails_held_out(gain)
     )
     causes = []
-    trust = known_probability(left, result.unknown) if result.detected else 1.0
+    trust = known_probability(left, result.unknown or fails_held_out(gain)) if result.detected else 1.0
     covariance = final.covariance()
     rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
     for effect in final.model.effects:
@@ -302,6 +304,11 @@ def explained_share(found: Round, final: Fit) -> float:
     fall = max(found.before.cost - found.candidates[0].fit.cost, 0.0)
     left = max(final.chi2_per_dof - LEFT_NOISE, 0.0) * final.count
     return fall / max(fall + left, 1e-300)
+
+
+def fails_held_out(gain: Gain | None) -> bool:
+    """Whether the extended model predicts held-out data worse than the baseline: no name is trusted then."""
+    return gain is not None and gain.after > WORSE * gain.before
 
 
 def known_probability(left: float, decoy_won: bool) -> float:
