@@ -15,11 +15,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from ident.extended import Effect, Model, Prediction, predict
+from ident.extended import Effect, Model, Prediction
 from ident.graybox import parameter_names
 from ident.hypotheses import Hypothesis, catalogue
 from ident.screening import Score, screen
-from ident.torque_fit import ANNEALING, Fit, Problem, Weights, fit, make_weights, residual
+from ident.torque_fit import (
+    ANNEALING,
+    Fit,
+    Problem,
+    Weights,
+    fit,
+    make_weights,
+    predictions,
+    residual,
+    weighted_cost,
+)
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
@@ -216,9 +226,10 @@ def attribute_once(
     found, scores = explore(problem, stage, hypotheses, level > 0, progress)
     before = current
     if level > 0:
-        preds = predictions(problem, stage)
+        preds = predictions(problem, stage.model, stage.remainders)
         sharp = make_weights(problem, preds, 0.0)
-        before = replace(current, cost=cost_under(problem, current, sharp), weights=sharp)
+        unextended = predictions(problem, current.model, current.remainders)
+        before = replace(current, cost=weighted_cost(problem, unextended, sharp), weights=sharp)
         ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
         ways = [(h, r, (*ladder, sharp)) for h, r in found[:FINALISTS]]
         if current.chi2_per_dof < HOPELESS:
@@ -255,7 +266,7 @@ def explore(
     Args:
         regardless: refit also where no linear step explains much.
     """
-    preds = predictions(problem, stage)
+    preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
     if not scores or not (regardless or scores[0].gain > WORTH_A_REFIT * excess):
@@ -274,21 +285,6 @@ def explore(
         (h, r if r.converged else refit(problem, r.model, stage.weights, r.remainders) or r) for h, r in hopeful(found)
     ]
     return sorted(found, key=lambda x: x[1].cost), scores
-
-
-def predictions(problem: Problem, result: Fit) -> list[Prediction]:
-    """What a fitted model predicts for the records it was fitted to."""
-    return [
-        predict(result.model, g, problem.sampling, W=W, steps=0)
-        for g, W in zip(problem.groups, result.remainders, strict=True)
-    ]
-
-
-def cost_under(problem: Problem, result: Fit, weights: Weights) -> float:
-    """Cost of a fitted model under other weights."""
-    preds = predictions(problem, result)
-    pairs = enumerate(zip(problem.groups, preds, strict=True))
-    return float(sum(np.sum(weights.apply(g, residual(group, pred)) ** 2) for g, (group, pred) in pairs))
 
 
 def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:

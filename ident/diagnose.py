@@ -27,7 +27,7 @@ from ident.noise import sample_noise
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
-from ident.torque_fit import Fit, Problem, fit
+from ident.torque_fit import Fit, Problem, fit, predictions
 from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict, Where
 
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
@@ -123,10 +123,8 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
 def with_measured_noise(problem: Problem, result: Fit) -> Problem:
     """Sample noise from the scatter between periods, for records that have a single one."""
     levels = []
-    for group, W in zip(problem.groups, result.remainders, strict=True):
-        pred = predict(result.model, group, problem.sampling, W=W, steps=0)
-        Z = pred.sampled_impedance
-        found = sample_noise(group, Z, problem.samples(group))
+    for group, pred in zip(problem.groups, predictions(problem, result.model, result.remainders), strict=True):
+        found = sample_noise(group, pred.sampled_impedance, problem.samples(group))
         if found is not None:
             levels.append(found)
     if not levels:
@@ -163,10 +161,7 @@ def diagnose_fully(
     result = attribute(problem, baseline, max_causes=max_causes, progress=say)
     say("gain on held-out data")
     before, after = baseline.model, result.final.model
-    first = [
-        predict(before, g, problem.sampling, W=W, steps=0)
-        for g, W in zip(problem.groups, baseline.remainders, strict=True)
-    ]
+    first = predictions(problem, before, baseline.remainders)
     affected = affected_joints(problem, baseline, first) if result.detected else ()
     if setup.held_out:
         errors, pairs = segment_errors(problem, setup.held_out, before, after)
@@ -179,10 +174,7 @@ def diagnose_fully(
         shown = problem.groups[:1]
         pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
     say("evidence")
-    last = [
-        predict(after, g, problem.sampling, W=W, steps=0)
-        for g, W in zip(problem.groups, result.final.remainders, strict=True)
-    ]
+    last = predictions(problem, after, result.final.remainders)
     verdict = make_verdict(dataset, setup, result, gain, first, last)
     kept = result.rounds if len(verdict.causes) else ()
     return Diagnosis(
@@ -311,9 +303,9 @@ def fails_held_out(gain: Gain | None) -> bool:
     return gain is not None and gain.after > WORSE * gain.before
 
 
-def known_probability(left: float, decoy_won: bool) -> float:
+def known_probability(left: float, refuted: bool) -> float:
     """How far the names can be trusted, from the share of the discrepancy that they leave."""
-    if decoy_won:
+    if refuted:
         return 0.4
     return float(1.0 / (1.0 + (left / 0.15) ** 2))
 

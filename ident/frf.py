@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import digamma
 
 from ident.dataset import Dataset, Segment
+from ident.records import mean_over_lines
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("auto", "h1", "jio", "ari", "har", "log")
@@ -255,7 +256,7 @@ def _covariance(
             # Distortion is smooth over frequency: its part is steadied before it is held at zero or more.
             k = np.arange(n)
             floor = noise[:, k, k].real
-            excess = shape * _mean_over_lines((total[:, k, k].real - floor) / shape, 2 * SMOOTH)
+            excess = shape * mean_over_lines((total[:, k, k].real - floor) / shape, 2 * SMOOTH)
             total[:, k, k] = floor + np.maximum(excess, 0.0)
     if total is None:
         total = np.zeros((F, n, n), complex)
@@ -291,21 +292,13 @@ def _smooth(Phi: np.ndarray, dof: int, shape: np.ndarray) -> np.ndarray:
     root = np.sqrt(variance)
     half = min(SMOOTH, int(np.ceil((ENOUGH / dof - 1) / 2)))
     if half > 0:
-        variance = shape * np.exp(_mean_over_lines(np.log(variance / shape), half) - digamma(dof) + np.log(dof))
+        variance = shape * np.exp(mean_over_lines(np.log(variance / shape), half) - digamma(dof) + np.log(dof))
     correlation = Phi / (root[:, :, None] * root[:, None, :])
     if dof < ENOUGH * n:
-        correlation = _mean_over_lines(correlation, SMOOTH) * min(1.0, dof * (2 * SMOOTH + 1) / (ENOUGH * n))
+        correlation = mean_over_lines(correlation, SMOOTH) * min(1.0, dof * (2 * SMOOTH + 1) / (ENOUGH * n))
         correlation[:, k, k] = 1.0
     scale = np.sqrt(variance)
     return scale[:, :, None] * correlation * scale[:, None, :]
-
-
-def _mean_over_lines(X: np.ndarray, half: int) -> np.ndarray:
-    """Mean over ``half`` lines on either side, along the first axis."""
-    total = np.concatenate([np.zeros_like(X[:1]), np.cumsum(X, axis=0)])
-    at = np.arange(len(X))
-    low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, len(X))
-    return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (X.ndim - 1))
 
 
 def _unvec(x: np.ndarray, n: int) -> np.ndarray:

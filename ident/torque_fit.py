@@ -129,7 +129,6 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
         S = noise_covariance(problem, group, pred)
         if group.window is not None:
             S = S * np.mean(group.window**2)
-        S = S.copy()
         k = np.arange(S.shape[1])
         S[0] *= 4.0
         if rho > 0:
@@ -307,7 +306,7 @@ def fit(
         ]
         Ws = [p.solution.W for p in preds]
         weights = fixed if fixed is not None else make_weights(problem, preds, rho)
-        cost = _cost(problem, preds, weights)
+        cost = weighted_cost(problem, preds, weights)
         # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
         trial_steps = int(any(e.hypothesis.channel == "model" for e in model.effects))
         moves, drift = _moves_links(model), np.zeros(len(x))
@@ -327,11 +326,8 @@ def fit(
                 step[:m] = np.clip(x[:m] + step[:m], center[:m] - LOG_RANGE, center[:m] + LOG_RANGE) - x[:m]
                 trial = unpack(model, x + step, limit)
                 try:
-                    new = [
-                        predict(trial, g, problem.sampling, W=W, steps=trial_steps)
-                        for g, W in zip(problem.groups, Ws, strict=True)
-                    ]
-                    new_cost = _cost(problem, new, weights)
+                    new = predictions(problem, trial, Ws, steps=trial_steps)
+                    new_cost = weighted_cost(problem, new, weights)
                 except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                     new_cost = np.inf
                 penalty = np.sum(prior * (_offset(x + step, center, m) ** 2 - off_sq(off)))
@@ -348,9 +344,9 @@ def fit(
             damping = max(damping / 10, 1e-9)
             preds, cost = new, new_cost
             if np.max(np.where(moves, drift, 0.0)) > STALE:
-                preds = [predict(model, g, problem.sampling, W=W, steps=1) for g, W in zip(problem.groups, Ws, strict=True)]
+                preds = predictions(problem, model, Ws, steps=1)
                 Ws = [p.solution.W for p in preds]
-                cost = _cost(problem, preds, weights)
+                cost = weighted_cost(problem, preds, weights)
                 drift[:] = 0.0
             if progress is not None:
                 progress(f"fit: stage {stage + 1}/{len(annealing)}, chi2/dof {cost / count:.3g}")
@@ -358,9 +354,9 @@ def fit(
                 converged = True
                 break
     if np.any(drift):
-        preds = [predict(model, g, problem.sampling, W=W, steps=1) for g, W in zip(problem.groups, Ws, strict=True)]
+        preds = predictions(problem, model, Ws, steps=1)
         Ws = [p.solution.W for p in preds]
-        cost = _cost(problem, preds, weights)
+        cost = weighted_cost(problem, preds, weights)
     H, _ = _normal(problem, model, preds, weights)
     return Fit(
         model, cost, count, H, coordinate_names(model, base_names), tuple(Ws), weights, converged
@@ -391,7 +387,15 @@ def _clip_effects(model: Model, step: np.ndarray) -> np.ndarray:
     return np.where(log, np.clip(step, -1.5, 1.5), step) if len(step) else step
 
 
-def _cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
+def predictions(problem: Problem, model: Model, remainders: Sequence[np.ndarray | None], steps: int = 0) -> list[Prediction]:
+    """What a model predicts for all records, from geometric remainders near their own."""
+    return [
+        predict(model, g, problem.sampling, W=W, steps=steps) for g, W in zip(problem.groups, remainders, strict=True)
+    ]
+
+
+def weighted_cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
+    """Whitened sum of squares of the torque residual."""
     return float(
         sum(
             np.sum(weights.apply(g, residual(group, pred)) ** 2)
