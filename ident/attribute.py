@@ -18,6 +18,7 @@ import scipy.stats
 from ident.extended import Effect, Model, Prediction
 from ident.graybox import parameter_names
 from ident.hypotheses import Hypothesis, catalogue
+from ident.parallel import map_threads
 from ident.screening import Score, screen
 from ident.torque_fit import (
     ANNEALING,
@@ -235,14 +236,16 @@ def attribute_once(
         if current.chi2_per_dof < HOPELESS:
             direct, _ = explore(problem, current, hypotheses, True, progress)
             ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
-        found = []
-        for h, result, steps in ways:
+
+        def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> tuple[Hypothesis, Fit]:
+            h, result, steps = way
             if progress is not None:
                 progress(f"finalist: {h.effect} at {h.place}")
             for weights in steps:
                 result = refit(problem, result.model, weights, result.remainders) or result
-            if result.weights is sharp:
-                found.append((h, result))
+            return h, result
+
+        found = [(h, r) for h, r in map_threads(sharpened, ways) if r.weights is sharp]
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
         if id(h) not in best or result.cost < best[id(h)][1].cost:
@@ -272,18 +275,20 @@ def explore(
     if not scores or not (regardless or scores[0].gain > WORTH_A_REFIT * excess):
         return [], scores
     chosen = with_gear_laws(problem, stage, preds, choose(scores), scores)
-    found = []
-    for i, score in enumerate(chosen):
+
+    def first_steps(score: Score) -> tuple[Hypothesis, Fit | None]:
         h = score.hypothesis
         if progress is not None:
-            progress(f"refit {i + 1}/{len(chosen)}: {h.effect} at {h.place}")
+            progress(f"refit: {h.effect} at {h.place}")
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
-        result = refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
-        if result is not None:
-            found.append((h, result))
-    found = [
-        (h, r if r.converged else refit(problem, r.model, stage.weights, r.remainders) or r) for h, r in hopeful(found)
-    ]
+        return h, refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
+
+    def finished(candidate: tuple[Hypothesis, Fit]) -> tuple[Hypothesis, Fit]:
+        h, r = candidate
+        return h, r if r.converged else refit(problem, r.model, stage.weights, r.remainders) or r
+
+    found = hopeful([(h, r) for h, r in map_threads(first_steps, chosen) if r is not None])
+    found = map_threads(finished, found)
     return sorted(found, key=lambda x: x[1].cost), scores
 
 
@@ -331,7 +336,7 @@ def choose(scores: Sequence[Score]) -> list[Score]:
 def with_gear_laws(
     problem: Problem, stage: Fit, preds: Sequence[Prediction], chosen: list[Score], scores: Sequence[Score]
 ) -> list[Score]:
-    """Candidates, and the laws of the gear at the joint that carries most of the discrepancy.
+    """The laws of the gear at the joint that carries most of the discrepancy, and the candidates.
 
     A gear that stiffens or softens moves its resonance with the amplitude; the linear step of a
     score says little about that, so these laws are fitted from a size of their own.
@@ -339,7 +344,7 @@ def with_gear_laws(
     excess = np.zeros(problem.structure.n)
     for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
         e = stage.weights.apply(g, residual(group, pred))
-        excess += np.sum(e**2 - 1.0, axis=(0, 1, 2))
+        excess += np.sum(np.abs(e) ** 2 - 2.0, axis=(0, 1))
     loudest = int(np.argmax(excess))
     have = {s.hypothesis.key for s in chosen}
     deflection = np.sqrt(
@@ -351,7 +356,7 @@ def with_gear_laws(
         h = score.hypothesis
         if h.joint == loudest and h.key not in have and "size" in h.options:
             extra.append(replace(score, start=h.options["size"](stiffness, deflection)))
-    return [*chosen, *extra]
+    return [*extra, *chosen]  # the longest fits first
 
 
 def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:

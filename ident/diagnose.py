@@ -11,7 +11,7 @@ import numpy as np
 from ident.attribute import Attribution, Candidate, Round, attribute, fit_baseline
 from ident.dataset import Dataset
 from ident.extended import Effect, Prediction, predict
-from ident.gain import measure_gain, segment_errors
+from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import (
     Parameters,
     Structure,
@@ -24,6 +24,7 @@ from ident.graybox import (
 )
 from ident.inverse import Sampling
 from ident.noise import sample_noise
+from ident.parallel import map_threads, one_thread_each
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
@@ -113,6 +114,7 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     return out[0], out[1]
 
 
+@one_thread_each
 def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:
     """Baseline parameters by maximum likelihood on the torque residual."""
     setup = set_up(dataset)
@@ -150,6 +152,7 @@ def diagnose(
     return diagnose_fully(dataset, max_causes=max_causes, progress=progress).verdict
 
 
+@one_thread_each
 def diagnose_fully(
     dataset: Dataset, *, max_causes: int = 4, progress: Callable[[str], None] | None = None
 ) -> Diagnosis:
@@ -200,18 +203,19 @@ def leave_one_out(setup: Setup, result: Attribution, affected: Sequence[int]) ->
     problem = setup.problem
     if len(problem.groups) < 2:
         return None
-    errors = []
-    for i, group in enumerate(problem.groups):
-        rest = tuple(g for k, g in enumerate(problem.groups) if k != i)
-        part = replace(problem, groups=rest)
+
+    def without(i: int) -> Errors:
+        part = replace(problem, groups=tuple(g for k, g in enumerate(problem.groups) if k != i))
         models = []
         for start in (result.baseline, result.final):
             remainders = [W for k, W in enumerate(start.remainders) if k != i]
             models.append(
                 fit(part, start.model, base_names=setup.names, iterations=4, remainders=remainders).model
             )
-        errors.append(segment_errors(problem, (group,), *models)[0])
-    joined = type(errors[0])(
+        return segment_errors(problem, problem.groups[i : i + 1], *models)[0]
+
+    errors = map_threads(without, range(len(problem.groups)))
+    joined = Errors(
         tuple(n for e in errors for n in e.segments),
         *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")),
     )

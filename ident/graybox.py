@@ -14,6 +14,7 @@ couple joints. All drive figures are referred to the link side of the gear.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
@@ -415,26 +416,34 @@ def impedance_derivatives(
 
 
 def _reduced_model(robot: Robot) -> pin.Model:
+    """The rigid chain of a robot's driven joints; a file is read once, as long as it stays the same."""
+    changed = robot.urdf.stat().st_mtime_ns if robot.urdf.exists() else 0
+    locked = tuple(sorted((name, float(angle)) for name, angle in robot.locked.items()))
+    return _read_chain(str(robot.urdf), changed, robot.joint_names, locked, str(robot.folder))
+
+
+@lru_cache(maxsize=8)
+def _read_chain(
+    urdf: str, changed: int, joint_names: tuple[str, ...], locked: tuple[tuple[str, float], ...], folder: str
+) -> pin.Model:
     try:
-        full = pin.buildModelFromUrdf(str(robot.urdf))
+        full = pin.buildModelFromUrdf(urdf)
     except Exception as err:
-        raise DataError("URDF", str(robot.urdf), str(err).splitlines()[0], "a readable URDF") from err
+        raise DataError("URDF", urdf, str(err).splitlines()[0], "a readable URDF") from err
     movable = set(full.names[1:])
-    missing = [name for name in robot.joint_names if name not in movable]
+    missing = [name for name in joint_names if name not in movable]
     if missing:
-        raise DataError("joint", str(robot.urdf), f"no {missing[0]}", f"one of {sorted(movable)}")
-    free = movable - set(robot.joint_names)
-    stray = sorted(free - set(robot.locked))
+        raise DataError("joint", urdf, f"no {missing[0]}", f"one of {sorted(movable)}")
+    angles = dict(locked)
+    free = movable - set(joint_names)
+    stray = sorted(free - set(angles))
     if stray:
-        raise DataError(
-            "joint", str(robot.folder), f"{stray[0]} neither driven nor locked", "a [locked] entry"
-        )
+        raise DataError("joint", folder, f"{stray[0]} neither driven nor locked", "a [locked] entry")
     q = pin.neutral(full)
     for name in free:
         joint = full.joints[full.getJointId(name)]
-        angle = float(robot.locked[name])
         q[joint.idx_q : joint.idx_q + joint.nq] = (
-            [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
+            [np.cos(angles[name]), np.sin(angles[name])] if joint.nq == 2 else [angles[name]]
         )
     return pin.buildReducedModel(full, [full.getJointId(name) for name in free], q)
 

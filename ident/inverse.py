@@ -18,7 +18,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 import scipy.fft
 
 from ident.graybox import (
@@ -32,6 +31,7 @@ from ident.graybox import (
     linearise,
 )
 from ident.records import Group
+from ident.recursion import chain_of, newton_euler
 
 REMAINDER_STEPS = 60  # fixed-point steps at most for the geometric remainder from a cold start
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
@@ -215,11 +215,9 @@ def geometric_remainder(structure: Structure, plane: Plane, group: Group, Q_a: n
 
 
 def inverse_dynamics(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Recursive Newton-Euler over arrays (..., N), by Pinocchio on all threads; (..., N) N m."""
-    shape = q.shape
-    pool = pin.ModelPool(structure.model, 2)
-    columns = [np.asfortranarray(x.reshape(-1, shape[-1]).T) for x in (q, v, a)]
-    return np.ascontiguousarray(pin.rneaInParallel(2, pool, *columns).T).reshape(shape)
+    """Torques of the chain along arrays (..., N); (..., N) N m."""
+    flat = [x.reshape(-1, q.shape[-1]) for x in (q, v, a)]
+    return newton_euler(chain_of(structure.model), *flat).reshape(q.shape)
 
 
 def solve(

@@ -52,11 +52,11 @@ def residual_covariance(
     P = group.U_periods.shape[1]
     if P < 2:
         S = white_covariance(Z, tau_std**2 / samples, q_std**2 / samples)
-        return S[group.keep]
+        return S[: group.n_compared]
     e = group.U_periods - np.einsum("lij,splj->spli", Z, group.Q_periods, optimize=True)
-    d = (e - e.mean(axis=1, keepdims=True))[:, :, group.keep]
+    d = (e - e.mean(axis=1, keepdims=True))[:, :, : group.n_compared]
     scale = e.shape[0] * (P - 1) * P
-    Zk = Z[group.keep]
+    Zk = Z[: group.n_compared]
     power = np.einsum("spki->ki", np.abs(d) ** 2) / scale
     tau_var, q_var = _white_levels(power, Zk)
     S = white_covariance(Zk, tau_var, q_var)
@@ -80,9 +80,9 @@ def sample_noise(group: Group, Z: np.ndarray, samples: int) -> tuple[np.ndarray,
     if P < 2:
         return None
     e = group.U_periods - np.einsum("lij,splj->spli", Z, group.Q_periods, optimize=True)
-    d = (e - e.mean(axis=1, keepdims=True))[:, :, group.keep]
+    d = (e - e.mean(axis=1, keepdims=True))[:, :, : group.n_compared]
     power = np.einsum("spki->ki", np.abs(d) ** 2) / (e.shape[0] * (P - 1))
-    tau_var, q_var = _white_levels(power, Z[group.keep])
+    tau_var, q_var = _white_levels(power, Z[: group.n_compared])
     return np.sqrt(tau_var * samples), np.sqrt(q_var * samples)
 
 

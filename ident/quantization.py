@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
 
 from ident.dataset import Dataset
 
@@ -18,6 +19,7 @@ BACKGROUND = 0.15  # median of the same over other steps: positions that dwell r
 STRETCH = 400.0  # half the positions in which steps blurred by noise are looked for, in least steps
 ON_GRID = 0.02  # distance from the grid, in steps, of samples that lie on it
 LEAST_CELLS = 20  # steps that the motion must span
+CELLS_PER_STEP = 8  # of the histogram of positions, in the least step
 CONTRAST = 0.35  # of the sum over samples of exp(2 pi j q / step), relative to its largest value
 
 
@@ -84,8 +86,14 @@ def _clusters(q: np.ndarray, least: float) -> tuple[float, float] | None:
     low, high = LEAST_CELLS / max(span, 1e-300), 1.0 / least
     if high <= low:
         return None
-    wave = np.arange(low, high, 0.2 / span)
-    contrast = np.abs(np.exp(2j * np.pi * np.outer(wave, q)).mean(axis=1))
+    cell = least / CELLS_PER_STEP
+    bins = int(np.ceil(span / cell)) + 1
+    length = scipy.fft.next_fast_len(5 * bins, real=True)
+    counts = np.bincount(np.floor((q - q.min()) / cell).astype(int), minlength=bins)
+    wave = np.arange(length // 2 + 1) / (length * cell)
+    inside = (wave >= low) & (wave <= high)
+    contrast = np.abs(scipy.fft.rfft(counts, n=length))[inside] / (len(q) * np.sinc(wave[inside] * cell))
+    wave = wave[inside]
     best = int(np.argmax(contrast))
     if contrast[best] < CONTRAST or np.median(contrast) > BACKGROUND * contrast[best]:
         return None

@@ -37,7 +37,7 @@ class Group:
         U_periods, Q_periods: (S, P, L, n) single periods, P >= 1.
         Q_link: (S, L, n) of the link encoders, or None.
         omega: (L,) rad/s.
-        keep: (K,) lines that are compared (a subset of 0..L-1).
+        n_compared: lines that are compared, K of them: 0..K-1.
         excited: (S, L) True where a segment excites.
         n_time: points of the time grid over one period.
         window: (n_time,) weight of a motion in the time domain, or None for periodic data.
@@ -57,7 +57,7 @@ class Group:
     Q_periods: np.ndarray
     Q_link: np.ndarray | None
     omega: np.ndarray
-    keep: np.ndarray
+    n_compared: int
     excited: np.ndarray
     n_time: int
     window: np.ndarray | None
@@ -100,18 +100,18 @@ class Group:
 
     def to_time(self, X: np.ndarray) -> np.ndarray:
         """Spectrum (..., L, m) on the time grid (..., n_time, m)."""
-        return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward", workers=2)
+        return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward", workers=1)
 
     def to_lines(self, x: np.ndarray) -> np.ndarray:
         """Time grid (..., n_time, m) to spectrum (..., L, m)."""
-        full = scipy.fft.rfft(x, axis=-2, norm="forward", workers=2)
+        full = scipy.fft.rfft(x, axis=-2, norm="forward", workers=1)
         return full[..., : len(self.omega), :]
 
     def observe(self, X: np.ndarray) -> np.ndarray:
         """What of a torque spectrum (..., L, m) is compared: its windowed lines (..., K, m)."""
         if self.window is not None:
             X = self.to_lines(self.to_time(X) * self.window[:, None])
-        return X[..., self.keep, :]
+        return X[..., : self.n_compared, :]
 
 
 def build_groups(
@@ -187,7 +187,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) ->
         Q_periods=Q_p,
         Q_link=link,
         omega=2 * np.pi * np.arange(n_lines) * fs / N,
-        keep=np.arange(top + 1),
+        n_compared=top + 1,
         excited=excited,
         n_time=scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True),
         window=None,
@@ -207,7 +207,7 @@ def _middle_periods(members: list[Segment]) -> np.ndarray:
 
 def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:
     """(P, N, n) time samples to (P, n_lines, n) spectra."""
-    return scipy.fft.rfft(x, axis=1, norm="forward", workers=2)[:, :n_lines]
+    return scipy.fft.rfft(x, axis=1, norm="forward", workers=1)[:, :n_lines]
 
 
 def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
@@ -239,7 +239,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
         Q_periods=Q[:, None],
         Q_link=link,
         omega=2 * np.pi * np.arange(n_lines) * fs / N,
-        keep=np.arange(top + 1),
+        n_compared=top + 1,
         excited=np.zeros((1, n_lines), bool),
         n_time=n_time,
         window=window,

@@ -23,14 +23,14 @@ def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: 
     joints = problem.structure.robot.joint_names
     for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
         e = fit.weights.apply(g, residual(group, pred))
-        power = np.sum(e**2, axis=0) - 2.0
+        power = np.abs(e) ** 2 - 2.0
         power[:, 0] += 1.0
-        line = group.keep[None, :]
+        line = np.arange(group.n_compared)[None, :]
         kinds = {
             "static torque": line == 0,
-            "excited lines": group.excited[:, group.keep],
-            "even nonlinear lines": (line % 2 == 0) & (line > 0) & ~group.excited[:, group.keep],
-            "odd nonlinear lines": (line % 2 == 1) & ~group.excited[:, group.keep],
+            "excited lines": group.excited[:, : group.n_compared],
+            "even nonlinear lines": (line % 2 == 0) & (line > 0) & ~group.excited[:, : group.n_compared],
+            "odd nonlinear lines": (line % 2 == 1) & ~group.excited[:, : group.n_compared],
         }
         if group.window is not None:
             kinds = {"motion": np.ones_like(line, bool)}
@@ -56,12 +56,12 @@ def spectrum_map(
     problem: Problem, fit: Fit, before: Sequence[Prediction], after: Sequence[Prediction]
 ) -> SpectrumMap:
     """Rms torque residual by operating point, joint and band."""
-    top = max(g.omega[g.keep[-1]] for g in problem.groups) / 2 / np.pi
+    top = max(g.omega[g.n_compared - 1] for g in problem.groups) / 2 / np.pi
     edges = np.geomspace(max(top / 200, 0.05), top * 1.0001, BANDS + 1)
     edges[0] = 0.0
     out = np.zeros((3, len(problem.groups), problem.structure.n, BANDS))
     for g, group in enumerate(problem.groups):
-        frequency = group.omega[group.keep] / 2 / np.pi
+        frequency = group.omega[: group.n_compared] / 2 / np.pi
         band = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, BANDS - 1)
         weight = np.where(frequency > 0, 2.0, 1.0)[:, None]
         pred = after[g]
@@ -103,7 +103,7 @@ def torque_traces(
         signals = []
         for X in (group.U, a.U, b.U, group.Q):
             Y = X[:1].copy()
-            Y[:, group.keep[-1] + 1 :] = 0.0
+            Y[:, group.n_compared :] = 0.0
             signals.append(group.to_time(Y)[0])
         t = np.arange(group.n_time) * group.period_time / group.n_time
         show = t <= SHOWN_SECONDS
@@ -143,7 +143,7 @@ def evidence_plot(problem: Problem, fit: Fit, predictions: Sequence[Prediction],
             power = np.sum(np.abs(group.U - without.U) ** 2, axis=(0, 1))
             j = int(np.argmax(power / np.maximum(np.sum(np.abs(group.U[:, 1:]) ** 2, axis=(0, 1)), 1e-300)))
         motion = pred.motion(group)
-        band = slice(group.keep[-1] + 1, None)
+        band = slice(group.n_compared, None)
         curves = []
         for X in (group.U - without.U, pred.U - without.U):
             X = X[..., j : j + 1].copy()
@@ -177,8 +177,8 @@ def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> s
     spectra = []
     for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
         e = np.abs(residual(group, pred)) ** 2
-        power += np.sum(fit.weights.apply(g, residual(group, pred)) ** 2, axis=(0, 1, 2))
-        spectra.append((group.omega[group.keep] / 2 / np.pi, e.sum(axis=0)))
+        power += np.sum(np.abs(fit.weights.apply(g, residual(group, pred))) ** 2, axis=(0, 1))
+        spectra.append((group.omega[: group.n_compared] / 2 / np.pi, e.sum(axis=0)))
         for s, level in enumerate(group.amplitude):
             levels.setdefault(float(level), []).append(float(e[s].sum()))
     j = int(np.argmax(power))

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.extended import Prediction
-from ident.hypotheses import Hypothesis, Screen, SignalScale
+from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
-from ident.records import Group
-from ident.torque_fit import Fit, Problem, jacobian, observe_columns, residual
+from ident.parallel import map_threads
+from ident.torque_fit import Fit, Problem, as_real, jacobian, observe_columns, residual
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
@@ -52,7 +52,7 @@ def signal_scale(
         r = group.to_time((group.U - pred.U)[..., joint : joint + 1])
         res.append(np.mean(r**2))
         starts += [*group.start, *(group.start + group.period_time)]
-        resonances.append(group.omega[group.keep[-1]] / 2 / np.pi)
+        resonances.append(group.omega[group.n_compared - 1] / 2 / np.pi)
     all_delta = np.concatenate(delta)
     top = float(np.median(resonances))
     return SignalScale(
@@ -70,93 +70,162 @@ def signal_scale(
 
 
 def screen(
-    problem: Problem,
-    fit: Fit,
-    predictions: Sequence[Prediction],
-    hypotheses: Sequence[Hypothesis],
-    *,
-    progress: Callable[[float], None] | None = None,
+    problem: Problem, fit: Fit, predictions: Sequence[Prediction], hypotheses: Sequence[Hypothesis]
 ) -> list[Score]:
     """Score every hypothesis, best first."""
-    base = _Base.build(problem, fit, predictions)
-    joints = problem.structure.n
-    scales = [signal_scale(problem, predictions, j, wave_numbers(problem, predictions, j)) for j in range(joints)]
-    motions = [pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True)]
-    scores = []
-    for i, h in enumerate(hypotheses):
-        scale = scales[h.joint if h.joint >= 0 else 0]
-        best: Score | None = None
-        for shape in h.shapes(scale):
-            score = _score(problem, fit, base, predictions, motions, h, shape)
-            if score is not None and (best is None or score.gain > best.gain):
-                best = score
-        if best is not None:
-            scores.append(best)
-        if progress is not None:
-            progress((i + 1) / len(hypotheses))
-    return sorted(scores, key=lambda s: -s.gain)
+    stage = _Stage.build(problem, fit, predictions)
+    scales = map_threads(
+        lambda j: signal_scale(problem, predictions, j, wave_numbers(problem, predictions, j)),
+        range(problem.structure.n),
+    )
+    together: dict[tuple, list[Hypothesis]] = {}
+    for h in hypotheses:
+        together.setdefault(h.key if h.channel == "model" else (h.channel, h.joint), []).append(h)
+    found = map_threads(lambda members: _best_scores(stage, members, scales), together.values())
+    return sorted((score for part in found for score in part), key=lambda s: -s.gain)
 
 
 @dataclass(frozen=True)
-class _Base:
-    """Whitened residual and fitted-coordinate columns, and their normal matrix inverse."""
+class _Stage:
+    """What all hypotheses are held against: whitened residual, fitted coordinates, normal matrix.
 
+    ``residuals`` (S, K, n) and ``columns`` (S, K, n, p) per group, complex.
+    """
+
+    problem: Problem
+    fit: Fit
+    predictions: Sequence[Prediction]
+    motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
     columns: tuple[np.ndarray, ...]
     inverse: np.ndarray
     moment: np.ndarray
 
     @classmethod
-    def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Base:
-        residuals, columns = [], []
-        for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
+    def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
+        def whitened(g: int) -> tuple[np.ndarray, np.ndarray]:
+            group, pred = problem.groups[g], predictions[g]
             J = observe_columns(group, jacobian(problem, fit.model, group, pred))
-            columns.append(fit.weights.apply(g, J).reshape(-1, J.shape[-1]))
-            residuals.append(fit.weights.apply(g, residual(group, pred)).ravel())
-        H = sum(J.T @ J for J in columns)
-        moment = sum(J.T @ r for J, r in zip(columns, residuals, strict=True))
+            return fit.weights.apply(g, residual(group, pred)), fit.weights.apply(g, J)
+
+        residuals, columns = zip(*map_threads(whitened, range(len(problem.groups))), strict=True)
+        real = [as_real(J) for J in columns]
+        H = sum(J.T @ J for J in real)
+        moment = sum(J.T @ as_real(r[..., None])[:, 0] for J, r in zip(real, residuals, strict=True))
         size = np.sqrt(np.maximum(np.diag(H), 1e-30))
         inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-10, hermitian=True) / np.outer(size, size)
-        return cls(tuple(residuals), tuple(columns), inverse, moment)
+        motions = tuple(pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True))
+        return cls(problem, fit, predictions, motions, residuals, columns, inverse, moment)
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Inner products of unit responses among themselves (m, m), with the residual (m,) and with the
+    fitted coordinates (p, m)."""
+
+    own: np.ndarray
+    residual: np.ndarray
+    columns: np.ndarray
+
+    def __add__(self, other: _Sums) -> _Sums:
+        return _Sums(self.own + other.own, self.residual + other.residual, self.columns + other.columns)
+
+
+@dataclass(frozen=True)
+class _Field:
+    """How a torque signal of one channel shows in a group: whitened torque per signal, (K, n).
+
+    ``residual`` (S, K) and ``columns`` (S, K, p) are the stage seen along it, so that a signal costs
+    no more than its own lines.
+    """
+
+    torque: np.ndarray
+    residual: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def build(cls, stage: _Stage, g: int, channel: str, joint: int) -> _Field:
+        group, pred = stage.problem.groups[g], stage.predictions[g]
+        torque = stage.fit.weights.apply(g, _gain(pred, channel, joint)[None, : group.n_compared])[0]
+        residual = np.einsum("kn,skn->sk", torque.conj(), stage.residuals[g])
+        columns = np.matmul(torque.conj()[:, None, :], stage.columns[g])[..., 0, :]
+        return cls(torque, residual, columns)
+
+
+def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequence[SignalScale]) -> list[Score]:
+    """The best shape of each hypothesis; all of one channel and joint, or a single one of the chain."""
+    channels = {hypotheses[0].channel, "motor"} - {"model"}
+    joint = hypotheses[0].joint
+    fields = [
+        {c: _Field.build(stage, g, c, joint) for c in channels} if group.window is None else {}
+        for g, group in enumerate(stage.problem.groups)
+    ]
+    best = []
+    for h in hypotheses:
+        scores = [_score(stage, fields, h, shape) for shape in h.shapes(scales[max(h.joint, 0)])]
+        scores = [s for s in scores if s is not None]
+        if scores:
+            best.append(max(scores, key=lambda s: s.gain))
+    return best
 
 
 def _score(
-    problem: Problem,
-    fit: Fit,
-    base: _Base,
-    predictions: Sequence[Prediction],
-    motions: Sequence[Motion],
-    h: Hypothesis,
-    shape: tuple[float, ...],
+    stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, shape: tuple[float, ...]
 ) -> Score | None:
-    G = b = C = None
+    total = None
     start: Callable[[np.ndarray], np.ndarray | None] = h.options.get("start", lambda c: None)
-    for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
+    for g, (group, pred) in enumerate(zip(stage.problem.groups, stage.predictions, strict=True)):
         if h.channel == "model":
             units = h.options["responses"](pred.structure, pred.par, pred.plane, group, pred.solution, shape)
-            X = fit.weights.apply(g, observe_columns(group, np.stack(units, axis=-1)))
+            sums = _whole_sums(stage, g, np.stack(units, axis=-1))
         else:
-            made = h.screen(motions[g], h.joint, pred.par.stiffness[h.joint], shape)
+            motion = stage.motions[g]
+            made = h.screen(motion, h.joint, pred.par.stiffness[h.joint], shape)
             start = made.start
-            X = _joint_response(fit, g, group, pred, motions[g], h, made)
-        X = X.reshape(-1, X.shape[-1])
-        if h.channel in ("motor", "drive"):
-            rows, J = X, base.columns[g]
-        else:
-            rows, J = X, base.columns[g]
-        G = rows.T @ rows if G is None else G + rows.T @ rows
-        b = rows.T @ base.residuals[g] if b is None else b + rows.T @ base.residuals[g]
-        C = J.T @ rows if C is None else C + J.T @ rows
-    size = np.sqrt(np.maximum(np.diag(G), 1e-300))
-    P = (G - C.T @ base.inverse @ C) / np.outer(size, size)
-    y = (b - C.T @ base.inverse @ base.moment) / size
-    inverse = np.linalg.pinv(P, rcond=1e-9, hermitian=True)
-    weights = inverse @ y
-    gain = float(y @ weights)
-    c = weights / size
-    if not np.isfinite(gain):
+            parts = [(h.channel, _lines(motion, made.signals))]
+            if made.motor:
+                parts.append(("motor", _lines(motion, made.motor)))
+            if group.window is None:
+                sums = _line_sums([(fields[g][c], X[:, : group.n_compared]) for c, X in parts])
+            else:
+                sums = _whole_sums(stage, g, sum(_gain(pred, c, h.joint)[None, :, :, None] * X[:, :, None] for c, X in parts))
+        total = sums if total is None else total + sums
+    if total is None:
         return None
-    return Score(h, gain, len(c), None if h.channel == "compliance" else _start(start, c, h, shape, problem), c, shape)
+    size = np.sqrt(np.maximum(np.diag(total.own), 1e-300))
+    P = (total.own - total.columns.T @ stage.inverse @ total.columns) / np.outer(size, size)
+    y = (total.residual - total.columns.T @ stage.inverse @ stage.moment) / size
+    if not (np.all(np.isfinite(P)) and np.all(np.isfinite(y))):
+        return None
+    weights = np.linalg.pinv(P, rcond=1e-9, hermitian=True) @ y
+    c = weights / size
+    return Score(h, float(y @ weights), len(c), _start(start, c, h, shape, stage.problem), c, shape)
+
+
+def _lines(motion: Motion, signals: Sequence[np.ndarray]) -> np.ndarray:
+    """Time signals or spectra as spectra (S, L, m)."""
+    return np.stack([x if np.iscomplexobj(x) else motion.lines(x) for x in signals], axis=-1)
+
+
+def _whole_sums(stage: _Stage, g: int, units: np.ndarray) -> _Sums:
+    """Sums of recorded torque spectra (S, L, n, m)."""
+    X = stage.fit.weights.apply(g, observe_columns(stage.problem.groups[g], units)).reshape(-1, units.shape[-1])
+    J, r = stage.columns[g].reshape(-1, len(stage.moment)), stage.residuals[g].ravel()
+    return _Sums((X.conj().T @ X).real, (X.conj().T @ r).real, (J.conj().T @ X).real)
+
+
+def _line_sums(parts: Sequence[tuple[_Field, np.ndarray]]) -> _Sums:
+    """Sums of signals (S, K, m) that act through fields at the same time, line by line."""
+    own, with_residual, with_columns = 0.0, 0.0, 0.0
+    for field, X in parts:
+        flat = X.reshape(-1, X.shape[-1])
+        for other, Y in parts:
+            weight = np.sum(field.torque.conj() * other.torque, axis=-1)[:, None]
+            own = own + (flat.conj().T @ (weight * Y).reshape(flat.shape)).real
+        with_residual = with_residual + (flat.conj().T @ field.residual.ravel()).real
+        columns = field.columns.reshape(len(flat), -1)
+        with_columns = with_columns + (columns.conj().T @ flat).real
+    return _Sums(own, with_residual, with_columns)
 
 
 def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | None:
@@ -172,27 +241,19 @@ def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | Non
     return None if p is None or not np.all(np.isfinite(p)) else np.asarray(p, float)
 
 
-def _joint_response(
-    fit: Fit, g: int, group: Group, pred: Prediction, motion: Motion, h: Hypothesis, made: Screen
-) -> np.ndarray:
-    """Whitened responses (2, S, K, n, m) of torque signals at one joint, by their channel."""
-    X = np.stack([x if np.iscomplexobj(x) else motion.lines(x) for x in made.signals], axis=-1)
+def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:
+    """Recorded torque per unit of a signal of a channel at a joint; (L, n)."""
     rec = pred.plane.record[:, None]
-    j = h.joint
-    if h.channel == "motor":
-        gain = rec * np.eye(pred.structure.n)[j]
-    elif h.channel == "spring":
-        gain = rec * pred.plane.spring_gain[:, :, j]
-    elif h.channel == "link":
-        gain = rec * pred.plane.link_gain[:, :, pred.structure.driven[j]]
-    elif h.channel == "position":
-        gain = rec * pred.plane.Z[:, :, j]
-    else:
-        gain = np.broadcast_to(np.eye(pred.structure.n, dtype=complex)[j], (len(group.omega), pred.structure.n))
-    response = gain[None, :, :, None] * X[:, :, None, :]
-    if made.motor:
-        response[:, :, j] += rec[None, :, :] * np.stack([motion.lines(x) for x in made.motor], axis=-1)
-    return fit.weights.apply(g, observe_columns(group, response))
+    unit = np.eye(pred.structure.n)[joint]
+    if channel == "motor":
+        return rec * unit
+    if channel == "spring":
+        return rec * pred.plane.spring_gain[:, :, joint]
+    if channel == "link":
+        return rec * pred.plane.link_gain[:, :, pred.structure.driven[joint]]
+    if channel == "position":
+        return rec * pred.plane.Z[:, :, joint]
+    return np.broadcast_to(unit.astype(complex), (len(rec), pred.structure.n))
 
 
 def wave_numbers(problem: Problem, predictions: Sequence[Prediction], joint: int) -> tuple[float, ...]:
@@ -220,7 +281,7 @@ def position_lines(
         motion = pred.motion(group)
         q = motion.q(joint)
         R = (group.U - pred.U)[..., joint : joint + 1].copy()
-        R[:, group.keep[-1] + 1 :] = 0.0
+        R[:, group.n_compared :] = 0.0
         r = group.to_time(R)[..., 0]
         step = max(1, q.shape[1] // 600)
         v, a = motion.v(joint), motion.acceleration(joint)

@@ -17,6 +17,7 @@ from ident.extended import Effect, Model, Prediction, predict, predict_at
 from ident.graybox import Parameters, Structure
 from ident.inverse import Sampling, baseline_jacobian
 from ident.noise import residual_covariance, white_covariance
+from ident.parallel import map_threads
 from ident.records import Group
 
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
@@ -57,17 +58,16 @@ class Problem:
 
 @dataclass(frozen=True)
 class Weights:
-    """(K, n, n) whitening per group: real-stacked residuals have unit variance under noise."""
+    """(K, n, n) whitening per group: real and imaginary parts of residuals have unit variance under noise."""
 
     whiten: tuple[np.ndarray, ...]
     covariance: tuple[np.ndarray, ...]
 
     def apply(self, g: int, X: np.ndarray) -> np.ndarray:
-        """Whiten (S, K, n) or (S, K, n, p) and stack real and imaginary parts in front."""
-        W = self.whiten[g]
-        Y = np.matmul(W, X if X.ndim == 4 else X[..., None])
-        Y = Y if X.ndim == 4 else Y[..., 0]
-        return np.stack([Y.real, Y.imag])
+        """Whiten (S, K, n) or (S, K, n, p), complex as given."""
+        if X.ndim == 4:
+            return np.matmul(self.whiten[g], X)
+        return np.matmul(self.whiten[g], X[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,10 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
     )
     k = np.arange(S.shape[1])
     S = S.copy()
-    S[:, k, k] += prediction.law_noise(group)[group.keep]
+    S[:, k, k] += prediction.law_noise(group)[: group.n_compared]
     if np.any(problem.step_std):
         variance = np.broadcast_to(np.square(problem.step_std) / problem.samples(group), k.shape)
-        S += white_covariance(prediction.sampled_impedance[group.keep], 0.0 * variance, variance)
+        S += white_covariance(prediction.sampled_impedance[: group.n_compared], 0.0 * variance, variance)
     return S
 
 
@@ -132,7 +132,7 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
         k = np.arange(S.shape[1])
         S[0] *= 4.0
         if rho > 0:
-            power = np.mean(np.abs(group.U[:, group.keep]) ** 2, axis=0)
+            power = np.mean(np.abs(group.U[:, : group.n_compared]) ** 2, axis=0)
             power[1:] += 1e-2 * power[1:].mean(axis=0)
             S[:, k, k] += rho**2 * power
         root = np.linalg.inv(np.linalg.cholesky(S)) * np.sqrt(2.0)
@@ -153,7 +153,7 @@ def data_count(problem: Problem) -> int:
     for group in problem.groups:
         S, n = len(group.segments), group.U.shape[-1]
         share = 1.0 if group.window is None else float(np.mean(group.window**2))
-        total += int(share * S * n * (2 * len(group.keep) - 1))
+        total += int(share * S * n * (2 * group.n_compared - 1))
     return total
 
 
@@ -227,7 +227,7 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> 
 
 def compared_lines(group: Group) -> int:
     """Lines that enter a comparison: up to the band for periodic data, all for a motion."""
-    return len(group.keep) if group.window is None else len(group.omega)
+    return group.n_compared if group.window is None else len(group.omega)
 
 
 def _effect_column(
@@ -300,10 +300,7 @@ def fit(
     preds: list[Prediction] = []
     for stage, rho in enumerate(annealing):
         x = pack(model)
-        preds = [
-            predict(model, g, problem.sampling, W=W, steps=None if W is None else 1)
-            for g, W in zip(problem.groups, Ws, strict=True)
-        ]
+        preds = predictions(problem, model, Ws, steps=None if Ws[0] is None else 1)
         Ws = [p.solution.W for p in preds]
         weights = fixed if fixed is not None else make_weights(problem, preds, rho)
         cost = weighted_cost(problem, preds, weights)
@@ -314,7 +311,7 @@ def fit(
         converged = False
         for _ in range(iterations):
             H, b = _normal(problem, model, preds, weights)
-            off = np.concatenate([x[: m + 1] - center, np.zeros(len(x) - m - 1)])
+            off = _offset(x, center)
             H_p, b_p = H + np.diag(prior), b - prior * off
             size = np.diag(H_p).copy()
             size[size <= 0] = 1.0
@@ -330,7 +327,7 @@ def fit(
                     new_cost = weighted_cost(problem, new, weights)
                 except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                     new_cost = np.inf
-                penalty = np.sum(prior * (_offset(x + step, center, m) ** 2 - off_sq(off)))
+                penalty = np.sum(prior * (_offset(x + step, center) ** 2 - off**2))
                 if np.isfinite(new_cost) and new_cost + penalty < cost:
                     improved = True
                     break
@@ -373,12 +370,9 @@ def _moves_links(model: Model) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def off_sq(off: np.ndarray) -> np.ndarray:
-    return off**2
-
-
-def _offset(x: np.ndarray, center: np.ndarray, m: int) -> np.ndarray:
-    return np.concatenate([x[: m + 1] - center, np.zeros(len(x) - m - 1)])
+def _offset(x: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Distance of the baseline coordinates from the centre of their prior, zero for effects."""
+    return np.concatenate([x[: len(center)] - center, np.zeros(len(x) - len(center))])
 
 
 def _clip_effects(model: Model, step: np.ndarray) -> np.ndarray:
@@ -387,18 +381,21 @@ def _clip_effects(model: Model, step: np.ndarray) -> np.ndarray:
     return np.where(log, np.clip(step, -1.5, 1.5), step) if len(step) else step
 
 
-def predictions(problem: Problem, model: Model, remainders: Sequence[np.ndarray | None], steps: int = 0) -> list[Prediction]:
+def predictions(
+    problem: Problem, model: Model, remainders: Sequence[np.ndarray | None], steps: int | None = 0
+) -> list[Prediction]:
     """What a model predicts for all records, from geometric remainders near their own."""
-    return [
-        predict(model, g, problem.sampling, W=W, steps=steps) for g, W in zip(problem.groups, remainders, strict=True)
-    ]
+    return map_threads(
+        lambda pair: predict(model, pair[0], problem.sampling, W=pair[1], steps=steps),
+        zip(problem.groups, remainders, strict=True),
+    )
 
 
 def weighted_cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
     """Whitened sum of squares of the torque residual."""
     return float(
         sum(
-            np.sum(weights.apply(g, residual(group, pred)) ** 2)
+            np.sum(np.abs(weights.apply(g, residual(group, pred))) ** 2)
             for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
         )
     )
@@ -407,20 +404,28 @@ def weighted_cost(problem: Problem, preds: Sequence[Prediction], weights: Weight
 def _normal(
     problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights
 ) -> tuple[np.ndarray, np.ndarray]:
-    H, b = 0.0, 0.0
-    for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
-        J = weights.apply(g, observe_columns(group, jacobian(problem, model, group, pred)))
-        r = weights.apply(g, residual(group, pred))
-        J = J.reshape(-1, J.shape[-1])
-        H = H + J.T @ J
-        b = b + J.T @ r.ravel()
-    return H, b
+    def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
+        group, pred = problem.groups[g], preds[g]
+        J = as_real(weights.apply(g, observe_columns(group, jacobian(problem, model, group, pred))))
+        r = as_real(weights.apply(g, residual(group, pred))[..., None])[:, 0]
+        return J.T @ J, J.T @ r
+
+    H, b = zip(*map_threads(of_group, range(len(problem.groups))), strict=True)
+    return sum(H), sum(b)
+
+
+def as_real(X: np.ndarray) -> np.ndarray:
+    """Complex (..., p) as real rows (2 x rows, p): real parts, then imaginary parts."""
+    X = X.reshape(-1, X.shape[-1])
+    out = np.empty((2 * len(X), X.shape[-1]))
+    out[: len(X)], out[len(X) :] = X.real, X.imag
+    return out
 
 
 def observe_columns(group: Group, X: np.ndarray) -> np.ndarray:
     """``Group.observe`` for (S, L, n, p)."""
     if group.window is None:
-        return X[:, group.keep]
+        return X[:, : group.n_compared]
     S, L, n, p = X.shape
     out = group.observe(X.reshape(S, L, n * p))
     return out.reshape(S, -1, n, p)

@@ -13,7 +13,7 @@ SWEEPS = 25  # periods at most until the steady state
 CUBIC, BACKLASH, SOFTENING, HYSTERESIS = 0, 1, 2, 3
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def bristle(v: np.ndarray, dt: float, length: float) -> np.ndarray:
     """Dahl bristle of unit Coulomb torque along velocity ``v`` (S, T).
 
@@ -35,7 +35,7 @@ def bristle(v: np.ndarray, dt: float, length: float) -> np.ndarray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
     """Maxwell slip element: torque of a spring that yields, along deflection ``x`` (S, T)."""
     S, T = x.shape
@@ -50,7 +50,7 @@ def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: float, h_old: float) -> float:
     """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``."""
     if code == 0:
@@ -71,7 +71,7 @@ def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: floa
     return min(max(h_old + a * (x - x_old), -b), b)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def spring_point(
     code: int, a: float, b: float, k: float, free: float, direct: float, x_old: float, h_old: float
 ) -> float:
@@ -81,7 +81,7 @@ def spring_point(
         for _ in range(60):
             step = (x + direct * a * x * x * x - free) / (1.0 + 3.0 * direct * a * x * x)
             x -= step
-            if abs(step) <= 1e-12 * abs(x) + 1e-18:
+            if abs(step) <= 1e-7 * abs(x) + 1e-18:  # the next one would be its square
                 break
         return x
     if code == 3:
@@ -102,7 +102,7 @@ def spring_point(
     return x
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def link_point(
     stiffness: float, friction: float, turn: float, q: float, v: float, dq: float, dv: float, h: float
 ) -> float:
@@ -129,7 +129,7 @@ def link_point(
     return h
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def periodic_start(start: np.ndarray, end: np.ndarray, decay: np.ndarray, T: int) -> None:
     """Replace ``start`` by the state that the torque of a period repeats; ``end`` as it left off."""
     for m in range(len(start)):
@@ -138,7 +138,7 @@ def periodic_start(start: np.ndarray, end: np.ndarray, decay: np.ndarray, T: int
         end[m] = start[m]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def link_loop(
     stiffness: float,
     friction: float,
@@ -195,7 +195,7 @@ def link_loop(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def spring_loop(
     code: int,
     a: float,

@@ -141,12 +141,13 @@ def transmission_error(joint: int, place: str) -> Hypothesis:
         n, reaction = shape
         damping = motion.par.damping[j] / motion.par.stiffness[j]
         spring = k * (1 + 1j * motion.group.omega * damping)
-        pairs = [parts(np.array([a, n, b, reaction]), motion, j) for a, b in ((1.0, 0.0), (0.0, 1.0))]
+        angle = n * motion.q(j)
+        sine, cosine, carried = np.sin(angle), np.cos(angle), reaction * n * motion.tau_s(j)
         return Screen(
-            tuple(spring * motion.lines(error) for error, _ in pairs),
+            (spring * motion.lines(sine), spring * motion.lines(cosine)),
             lambda c: np.array([c[0], n, c[1], reaction]),
             shape,
-            tuple(torque for _, torque in pairs),
+            (cosine * carried, -sine * carried),
         )
 
     return Hypothesis(

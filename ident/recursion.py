@@ -1,0 +1,193 @@
+"""Newton-Euler recursion along many points of a Pinocchio chain, in compiled code.
+
+Pinocchio's own ``rnea`` over arrays keeps the interpreter's lock; this one lets other threads run,
+and goes joint by joint over a block of points that stays in the cache. Same numbers (tests).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numba import njit
+
+BLOCK = 256  # points
+
+
+@dataclass(frozen=True)
+class Chain:
+    """An open chain of joints with one coordinate each, as arrays over N joints.
+
+    Attributes:
+        parent: (N,) index of the joint before, -1 for the base.
+        prismatic: (N,) bool.
+        axis: (N, 3) in the frame of the joint.
+        rotation, origin: (N, 3, 3), (N, 3) m, frame of the joint at zero in that of its parent.
+        mass: (N,) kg; lever: (N, 3) m; inertia: (N, 3, 3) kg m2 about the centre of mass.
+        gravity: (3,) m/s2.
+    """
+
+    parent: np.ndarray
+    prismatic: np.ndarray
+    axis: np.ndarray
+    rotation: np.ndarray
+    origin: np.ndarray
+    mass: np.ndarray
+    lever: np.ndarray
+    inertia: np.ndarray
+    gravity: np.ndarray
+
+
+def chain_of(model: pin.Model) -> Chain:
+    """Arrays of a model whose joints are unaligned revolute or prismatic ones, in the order of ``q``."""
+    joints = range(1, model.njoints)
+    return Chain(
+        parent=np.array([model.parents[i] - 1 for i in joints]),
+        prismatic=np.array(["Prismatic" in model.joints[i].shortname() for i in joints]),
+        axis=np.array([model.joints[i].extract().axis for i in joints], float).reshape(-1, 3),
+        rotation=np.array([model.jointPlacements[i].rotation for i in joints]),
+        origin=np.array([model.jointPlacements[i].translation for i in joints]),
+        mass=np.array([model.inertias[i].mass for i in joints]),
+        lever=np.array([model.inertias[i].lever for i in joints]),
+        inertia=np.array([model.inertias[i].inertia for i in joints]),
+        gravity=np.asarray(model.gravity.linear, float).copy(),
+    )
+
+
+def newton_euler(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Joint torques (points, N), N m, along coordinates, velocities and accelerations of that shape.
+
+    Source: Luh, Walker and Paul, J. Dyn. Syst. Meas. Control 102 (1980), in frames of the joints.
+    """
+    columns = [np.ascontiguousarray(x.T) for x in (q, np.sin(q), np.cos(q), v, a)]
+    out = _recursion(
+        chain.parent,
+        chain.prismatic,
+        chain.axis,
+        chain.rotation,
+        chain.origin,
+        chain.mass,
+        chain.lever,
+        chain.inertia,
+        chain.gravity,
+        *columns,
+    )
+    return np.ascontiguousarray(out.T)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _scaled(a, k):
+    return a[0] * k, a[1] * k, a[2] * k
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _times(M, x):
+    return (
+        M[0, 0] * x[0] + M[0, 1] * x[1] + M[0, 2] * x[2],
+        M[1, 0] * x[0] + M[1, 1] * x[1] + M[1, 2] * x[2],
+        M[2, 0] * x[0] + M[2, 1] * x[1] + M[2, 2] * x[2],
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _times_transposed(M, x):
+    return (
+        M[0, 0] * x[0] + M[1, 0] * x[1] + M[2, 0] * x[2],
+        M[0, 1] * x[0] + M[1, 1] * x[1] + M[2, 1] * x[2],
+        M[0, 2] * x[0] + M[1, 2] * x[1] + M[2, 2] * x[2],
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turned(x, axis, sine, cosine):
+    """Rodrigues: ``x`` turned about ``axis`` by an angle of that sine and cosine."""
+    along = _dot(axis, x) * (1.0 - cosine)
+    return _add(_add(_scaled(x, cosine), _scaled(_cross(axis, x), sine)), _scaled(axis, along))
+
+
+@njit(cache=True, nogil=True)
+def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, gravity, q, sine, cosine, v, a):
+    N, T = q.shape
+    out = np.empty((N, T))
+    w = np.empty((N, 3, BLOCK))
+    dw = np.empty((N, 3, BLOCK))
+    acc = np.empty((N, 3, BLOCK))
+    force = np.empty((N, 3, BLOCK))
+    moment = np.empty((N, 3, BLOCK))
+    for begin in range(0, T, BLOCK):
+        B = min(BLOCK, T - begin)
+        for i in range(N):
+            p, slides = parent[i], prismatic[i]
+            e = (axis[i, 0], axis[i, 1], axis[i, 2])
+            c = (lever[i, 0], lever[i, 1], lever[i, 2])
+            for b in range(B):
+                t = begin + b
+                if p < 0:
+                    w_p, dw_p = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+                    acc_p = (-gravity[0], -gravity[1], -gravity[2])
+                else:
+                    w_p = (w[p, 0, b], w[p, 1, b], w[p, 2, b])
+                    dw_p = (dw[p, 0, b], dw[p, 1, b], dw[p, 2, b])
+                    acc_p = (acc[p, 0, b], acc[p, 1, b], acc[p, 2, b])
+                at = (origin[i, 0], origin[i, 1], origin[i, 2])
+                if slides:
+                    at = _add(at, _scaled(_times(rotation[i], e), q[i, t]))
+                there = _add(_add(acc_p, _cross(dw_p, at)), _cross(w_p, _cross(w_p, at)))
+                w_i = _times_transposed(rotation[i], w_p)
+                dw_i = _times_transposed(rotation[i], dw_p)
+                acc_i = _times_transposed(rotation[i], there)
+                if slides:
+                    acc_i = _add(acc_i, _add(_scaled(_cross(w_i, e), 2.0 * v[i, t]), _scaled(e, a[i, t])))
+                else:
+                    w_i = _turned(w_i, e, -sine[i, t], cosine[i, t])
+                    dw_i = _turned(dw_i, e, -sine[i, t], cosine[i, t])
+                    acc_i = _turned(acc_i, e, -sine[i, t], cosine[i, t])
+                    dw_i = _add(dw_i, _add(_scaled(_cross(w_i, e), v[i, t]), _scaled(e, a[i, t])))
+                    w_i = _add(w_i, _scaled(e, v[i, t]))
+                f = _scaled(_add(_add(acc_i, _cross(dw_i, c)), _cross(w_i, _cross(w_i, c))), mass[i])
+                m = _add(_times(inertia[i], dw_i), _cross(w_i, _times(inertia[i], w_i)))
+                m = _add(m, _cross(c, f))
+                for k in range(3):
+                    w[i, k, b] = w_i[k]
+                    dw[i, k, b] = dw_i[k]
+                    acc[i, k, b] = acc_i[k]
+                    force[i, k, b] = f[k]
+                    moment[i, k, b] = m[k]
+        for i in range(N - 1, -1, -1):
+            p, slides = parent[i], prismatic[i]
+            e = (axis[i, 0], axis[i, 1], axis[i, 2])
+            for b in range(B):
+                t = begin + b
+                f = (force[i, 0, b], force[i, 1, b], force[i, 2, b])
+                m = (moment[i, 0, b], moment[i, 1, b], moment[i, 2, b])
+                out[i, t] = _dot(e, f) if slides else _dot(e, m)
+                if p < 0:
+                    continue
+                at = (origin[i, 0], origin[i, 1], origin[i, 2])
+                if slides:
+                    at = _add(at, _scaled(_times(rotation[i], e), q[i, t]))
+                else:
+                    f = _turned(f, e, sine[i, t], cosine[i, t])
+                    m = _turned(m, e, sine[i, t], cosine[i, t])
+                f = _times(rotation[i], f)
+                m = _add(_times(rotation[i], m), _cross(at, f))
+                for k in range(3):
+                    force[p, k, b] += f[k]
+                    moment[p, k, b] += m[k]
+    return out
