@@ -385,7 +385,7 @@ def weigh(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
     """
     cost = np.array([c.fit.cost for c in candidates])
     excess = max(cost.min() - count, 0.0)
-    complexity = np.array([len(c.hypothesis.parameters) for c in candidates])
+    complexity = np.array([c.hypothesis.complexity for c in candidates])
     decoy = np.array([c.hypothesis.decoy for c in candidates], float)
     evidence = -0.5 * (cost - cost.min()) / (TEMPER + MODEL_ERROR_SHARE / 6.0 * excess)
     evidence = evidence - NATS_PER_PARAMETER * complexity - DECOY_NATS * decoy

@@ -184,7 +184,7 @@ def diagnose_fully(
         verdict=verdict,
         robot=dataset.robot,
         joints=dataset.joints,
-        frf=frf_views(dataset, problem, before, after),
+        frf=frf_views(dataset, problem, first, last),
         spectrum=spectrum_map(problem, baseline, first, last),
         evidence=tuple(
             evidence_plot(problem, result.final, last, i) for i in range(min(len(kept), len(after.effects)))

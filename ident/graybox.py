@@ -26,6 +26,29 @@ _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
+class LinkChange:
+    """How the body of a link differs from its description.
+
+    Attributes:
+        mass, inertia: factors, the latter on the inertia about the centre of mass.
+        com: (3,) shift of the centre of mass in the frame of the link's joint, m.
+    """
+
+    mass: float = 1.0
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    inertia: float = 1.0
+
+    def of(self, body: pin.Inertia) -> pin.Inertia:
+        """The body with the change made."""
+        return pin.Inertia(body.mass * self.mass, body.lever + np.asarray(self.com), body.inertia * self.inertia)
+
+    def __add__(self, other: LinkChange) -> LinkChange:
+        """Both changes, one after the other."""
+        com = (self.com[0] + other.com[0], self.com[1] + other.com[1], self.com[2] + other.com[2])
+        return LinkChange(self.mass * other.mass, com, self.inertia * other.inertia)
+
+
+@dataclass(frozen=True)
 class Structure:
     """What parameters do not change: the chain, and which of its coordinates are driven.
 
@@ -35,7 +58,7 @@ class Structure:
         elastic: (n_e,) indices of the elastic hinges.
         bodies: link name -> (Pinocchio joint index, placement of the link frame in it).
         robot: the robot it was built from.
-        hinges, loads, scale_links: what ``build_structure`` was given beyond the robot.
+        hinges, loads, links: what ``build_structure`` was given beyond the robot.
     """
 
     model: pin.Model
@@ -45,7 +68,7 @@ class Structure:
     robot: Robot
     hinges: tuple[Elasticity, ...] = ()
     loads: tuple[tuple[str, pin.Inertia], ...] = ()
-    scale_links: dict[str, float] = field(default_factory=dict)
+    links: dict[str, LinkChange] = field(default_factory=dict)
 
     @property
     def n(self) -> int:
@@ -150,7 +173,7 @@ def build_structure(
     *,
     elasticities: tuple[Elasticity, ...] = (),
     loads: tuple[tuple[str, pin.Inertia], ...] = (),
-    scale_links: dict[str, float] | None = None,
+    links: dict[str, LinkChange] | None = None,
 ) -> Structure:
     """Pinocchio chain of a robot, with elastic hinges and loads placed.
 
@@ -158,7 +181,7 @@ def build_structure(
         robot: the arm.
         elasticities: elastic hinges beyond those of the robot.
         loads: (link name, inertia in that link's frame) beyond those of the robot.
-        scale_links: link name -> factor on its mass and inertia.
+        links: link name -> how its body differs from its description.
 
     Raises:
         DataError: where the URDF lacks a joint or link that the robot names, or holds a joint
@@ -170,7 +193,7 @@ def build_structure(
     model.name = robot.name
     model.gravity.linear = np.asarray(robot.gravity, float)
     parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
-    factors = {parent[link]: factor for link, factor in (scale_links or {}).items()}
+    changed = {parent[link]: change for link, change in (links or {}).items()}
     carrier = {0: _add_hinges(model, 0, "base", hinges, pin.SE3.Identity())}
     index: dict[str, int] = {}
     for i in range(1, source.njoints):
@@ -180,9 +203,8 @@ def build_structure(
         )
         index[name] = model.idx_vs[k]
         carrier[i] = _add_hinges(model, k, name, hinges, pin.SE3.Identity())
-        own, factor = source.inertias[i], factors.get(i, 1.0)
-        scaled = pin.Inertia(own.mass * factor, own.lever, own.inertia * factor)
-        model.appendBodyToJoint(carrier[i], scaled, pin.SE3.Identity())
+        body = changed.get(i, LinkChange()).of(source.inertias[i])
+        model.appendBodyToJoint(carrier[i], body, pin.SE3.Identity())
     bodies = {
         f.name: (carrier[f.parentJoint], f.placement)
         for f in source.frames
@@ -202,7 +224,7 @@ def build_structure(
         [model.idx_vs[model.getJointId(_hinge_name(h))] for h in hinges], dtype=int
     )
     return Structure(
-        model, driven, elastic, bodies, robot, tuple(elasticities), tuple(loads), dict(scale_links or {})
+        model, driven, elastic, bodies, robot, tuple(elasticities), tuple(loads), dict(links or {})
     )
 
 

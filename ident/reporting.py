@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+import scipy.fft
 
-from ident.dataset import Dataset
+from ident.dataset import Dataset, Segment
 from ident.extended import Model, Prediction, predict
-from ident.graybox import equilibrium, linearise, sampled_frf
+from ident.frf import estimate_frf
 from ident.records import Group
 from ident.torque_fit import Fit, Problem, noise_covariance, residual
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
+from robot_assets.errors import DataError
 
 BANDS = 8
 SHOWN_SECONDS = 6.0
@@ -72,26 +75,42 @@ def spectrum_map(
     return SpectrumMap(edges, *np.sqrt(out), tuple(g.operating_point for g in problem.groups))
 
 
-def frf_views(dataset: Dataset, problem: Problem, before: Model, after: Model) -> tuple[FrfView, ...]:
-    """Measured FRFs with the linearised baseline and extended models, where they can be formed."""
-    from ident.frf import estimate_frf
-    from robot_assets.errors import DataError
+def frf_views(
+    dataset: Dataset, problem: Problem, before: Sequence[Prediction], after: Sequence[Prediction]
+) -> tuple[FrfView, ...]:
+    """Measured FRFs with those of the baseline and extended models, where they can be formed.
 
+    A model's FRF is what the same estimator makes of the torque that the model predicts along the
+    measured motion, so that nonlinear effects count as they do in the measured one.
+    """
     try:
         frf = estimate_frf(dataset)
+        models = [estimate_frf(with_torque(dataset, problem, preds), estimator=frf.estimator) for preds in (before, after)]
     except DataError:
         return ()
-    views = []
-    for i, point in enumerate(frf.operating_points):
-        curves = []
-        for model in (before, after):
-            structure, par = model.built()
-            lin = linearise(structure, equilibrium(structure, par, frf.q0[i]))
-            curves.append(
-                sampled_frf(structure, par, lin, frf.frequency, problem.sampling.sample_time, problem.sampling.hold)[0]
-            )
-        views.append(FrfView(point, frf.frequency, frf.G[i], frf.total_std[i], *curves))
-    return tuple(views)
+    return tuple(
+        FrfView(point, frf.frequency, frf.G[i], frf.total_std[i], *(m.G[i] for m in models))
+        for i, point in enumerate(frf.operating_points)
+    )
+
+
+def with_torque(dataset: Dataset, problem: Problem, predictions: Sequence[Prediction]) -> Dataset:
+    """The dataset with the torque of its periodic records replaced by the predicted one."""
+    spectra = {
+        name: U
+        for group, pred in zip(problem.groups, predictions, strict=True)
+        if group.window is None
+        for name, U in zip(group.segments, pred.U, strict=True)
+    }
+
+    def replaced(s: Segment) -> Segment:
+        if s.name not in spectra:
+            return s
+        period = scipy.fft.irfft(spectra[s.name], n=s.period, axis=0, norm="forward")
+        whole = np.tile(period, (s.transient_periods + s.steady_periods, 1))
+        return replace(s, tau=whole)
+
+    return replace(dataset, segments=tuple(replaced(s) for s in dataset.segments))
 
 
 def torque_traces(

@@ -289,10 +289,7 @@ def fit(
     """
     limit = TIMING_LIMIT * problem.sampling.sample_time
     m = len(model.par.to_log())
-    center = np.concatenate([problem.nominal.to_log(), [0.0]])
-    prior = np.zeros(len(pack(model)))
-    prior[:m] = PRIOR_LOG_STD**-2
-    prior[m] = (PRIOR_TIMING * problem.sampling.sample_time) ** -2
+    center, prior = _prior(problem, model)
     Ws = list(remainders) if remainders is not None else [None] * len(problem.groups)
     count = data_count(problem)
     fixed = weights
@@ -311,7 +308,7 @@ def fit(
         converged = False
         for _ in range(iterations):
             H, b = _normal(problem, model, preds, weights)
-            off = _offset(x, center)
+            off = x - center
             H_p, b_p = H + np.diag(prior), b - prior * off
             size = np.diag(H_p).copy()
             size[size <= 0] = 1.0
@@ -327,7 +324,7 @@ def fit(
                     new_cost = weighted_cost(problem, new, weights)
                 except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                     new_cost = np.inf
-                penalty = np.sum(prior * (_offset(x + step, center) ** 2 - off**2))
+                penalty = np.sum(prior * ((off + step) ** 2 - off**2))
                 if np.isfinite(new_cost) and new_cost + penalty < cost:
                     improved = True
                     break
@@ -370,9 +367,13 @@ def _moves_links(model: Model) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _offset(x: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Distance of the baseline coordinates from the centre of their prior, zero for effects."""
-    return np.concatenate([x[: len(center)] - center, np.zeros(len(x) - len(center))])
+def _prior(problem: Problem, model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and weight (inverse variance) of the weak prior of each fitted coordinate."""
+    ps = [q for effect in model.effects for q in effect.hypothesis.parameters]
+    baseline = problem.nominal.to_log()
+    center = np.concatenate([baseline, [0.0], [q.to_internal(q.center) if np.isfinite(q.spread) else 0.0 for q in ps]])
+    timing = (PRIOR_TIMING * problem.sampling.sample_time) ** -2
+    return center, np.concatenate([np.full(len(baseline), PRIOR_LOG_STD**-2), [timing], [q.spread**-2 for q in ps]])
 
 
 def _clip_effects(model: Model, step: np.ndarray) -> np.ndarray:

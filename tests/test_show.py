@@ -177,7 +177,7 @@ def test_effects_at_one_joint_add_up(ur10):
         cause("dress_pack", "elbow_joint", stiffness=50.0, friction=0.3),
         cause("joint_coupling", "elbow_joint", ratio=0.1),
         cause("payload", "flange", mass=2.0, com_x=0.0, com_y=0.1, com_z=0.0),
-        cause("link_inertia", "forearm_link", scale=1.2),
+        cause("link_inertia", "forearm_link", mass=1.2, com_x=0.0, com_y=0.01, com_z=0.0, inertia=1.1),
         cause("transverse_elasticity", "elbow_joint", stiffness=2e4, damping=20.0, axis_x=1.0, axis_y=0.0, axis_z=0.0),
         cause("base_elasticity", "base", stiffness=5e5, damping=500.0, axis_x=1.0, axis_y=0.0, axis_z=0.0),
         cause("cogging", "elbow_joint", amplitude=1.0, periods_per_rev=101.0, phase=0.2),

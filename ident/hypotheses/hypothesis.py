@@ -20,6 +20,7 @@ class Parameter:
         log: fitted as a logarithm (positive parameters that span decades).
         nuisance: fitted but not reported.
         step: finite-difference step in fitted coordinates.
+        center, spread: a weak prior, external units, the spread in fitted coordinates; none where infinite.
     """
 
     name: str
@@ -29,6 +30,8 @@ class Parameter:
     log: bool = False
     nuisance: bool = False
     step: float = 1e-4
+    center: float = 0.0
+    spread: float = np.inf
 
     def to_internal(self, value: float) -> float:
         value = float(np.clip(value, self.lower, self.upper))
@@ -76,7 +79,8 @@ class Hypothesis:
         sentence: evidence with {joint} and the parameters as fields.
         options: what single hypotheses need beyond that. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
-            place of one with parameters ``old`` at the same joint.
+            place of one with parameters ``old`` at the same joint. ``minor`` parameters, the last ones, do not
+            count against it.
     """
 
     effect: str
@@ -94,6 +98,11 @@ class Hypothesis:
     @property
     def decoy(self) -> bool:
         return self.effect.startswith("unknown:")
+
+    @property
+    def complexity(self) -> int:
+        """Parameters that count against a hypothesis when it is weighed."""
+        return len(self.parameters) - self.options.get("minor", 0)
 
     @property
     def key(self) -> tuple[str, str]:

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from ident.graybox import (
+    LinkChange,
     Parameters,
     Structure,
     build_structure,
@@ -32,6 +33,9 @@ from ident.inverse import (
 from ident.records import Group
 from robot_assets.robot import Elasticity
 
+SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
+LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
+
 
 @dataclass(frozen=True)
 class Change:
@@ -39,14 +43,14 @@ class Change:
 
     elasticities: tuple[Elasticity, ...] = ()
     loads: tuple[tuple[str, pin.Inertia], ...] = ()
-    scale_links: tuple[tuple[str, float], ...] = ()
+    links: tuple[tuple[str, LinkChange], ...] = ()
     coupling: tuple[tuple[int, int, float], ...] = ()
 
     def __add__(self, other: Change) -> Change:
         return Change(
             self.elasticities + other.elasticities,
             self.loads + other.loads,
-            self.scale_links + other.scale_links,
+            self.links + other.links,
             self.coupling + other.coupling,
         )
 
@@ -55,15 +59,15 @@ def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple
     """The chain and parameters with a change made."""
     if change == Change():
         return structure, par
-    if change.elasticities or change.loads or change.scale_links:
-        scales = dict(structure.scale_links)
-        for link, factor in change.scale_links:
-            scales[link] = scales.get(link, 1.0) * factor
+    if change.elasticities or change.loads or change.links:
+        links = dict(structure.links)
+        for link, how in change.links:
+            links[link] = links.get(link, LinkChange()) + how
         structure = build_structure(
             structure.robot,
             elasticities=structure.hinges + change.elasticities,
             loads=structure.loads + change.loads,
-            scale_links=scales,
+            links=links,
         )
     coupling = par.coupling.copy()
     for row, column, ratio in change.coupling:
@@ -136,10 +140,13 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
 
 
 def payload(link: str) -> Hypothesis:
-    """Unknown point load at ``com`` in the frame of the flange's link."""
+    """Unknown load with its centre of mass at ``com`` in the frame of the flange's link.
+
+    ``inertia`` about the centre is that of a ball: what the data see of a compact load beyond a point.
+    """
 
     def change(p) -> Change:
-        return Change(loads=((link, pin.Inertia(float(p[0]), np.asarray(p[1:4], float), np.zeros((3, 3)))),))
+        return Change(loads=((link, pin.Inertia(float(p[0]), np.asarray(p[1:4], float), p[4] * np.eye(3))),))
 
     def responses(structure, par, plane, group, solution, shape):
         joint, placement = structure.bodies[link]
@@ -151,7 +158,7 @@ def payload(link: str) -> Hypothesis:
     def start(c):
         if c[0] <= 0:
             return None
-        return np.concatenate([[c[0]], np.clip(c[1:] / c[0], -0.4, 0.4)])
+        return np.concatenate([[c[0]], np.clip(c[1:] / c[0], -0.4, 0.4), [c[0] * SMALL_LOAD**2]])
 
     return Hypothesis(
         "payload",
@@ -163,6 +170,7 @@ def payload(link: str) -> Hypothesis:
             Parameter("com_x", "m", -2.0, 2.0, step=1e-3),
             Parameter("com_y", "m", -2.0, 2.0, step=1e-3),
             Parameter("com_z", "m", -2.0, 2.0, step=1e-3),
+            Parameter("inertia", "kg m2", 1e-9, 1e4, log=True, step=1e-1),
         ),
         None,
         lambda scale: [()],
@@ -170,38 +178,57 @@ def payload(link: str) -> Hypothesis:
         "An unknown load of {mass:.3g} kg hangs at the flange: anti-resonances fall at every posture and the gravity"
         " torque changes with them.",
         variable="posture",
-        options={"change": change, "responses": responses, "start": start},
+        options={"change": change, "responses": responses, "start": start, "minor": 1},
     )
 
 
 def link_inertia(link: str, joint_index: int) -> Hypothesis:
-    """Mass and inertia of a link are a multiple of those of the model."""
+    """Mass, centre of mass and inertia of a link are not those of the model.
 
-    def change(p) -> Change:
-        return Change(scale_links=((link, float(p[0])),))
+    ``mass`` and ``inertia`` (about the centre of mass) are factors, ``com`` is a shift in the frame of
+    the link's joint. The data seldom determine all of them: what they leave open stays near the model.
+    """
+
+    def how(p) -> LinkChange:
+        return LinkChange(float(p[0]), (float(p[1]), float(p[2]), float(p[3])), float(p[4]))
 
     def responses(structure, par, plane, group, solution, shape):
         joint, _ = structure.bodies[link]
-        single, double = (build_structure(structure.robot, scale_links={link: f}) for f in (1.0, 2.0))
-        body = single.bodies[link][0]
-        column = double.model.inertias[body].toDynamicParameters() - single.model.inertias[body].toDynamicParameters()
-        return [_inertial_response(structure, joint, pin.SE3.Identity(), column, plane, group, solution)]
+        bare = build_structure(structure.robot, links=structure.links)
+        own = bare.model.inertias[bare.bodies[link][0]]
+        base = own.toDynamicParameters()
+        units = []
+        for i, step in enumerate(LINK_STEPS):
+            p = np.array([1.0, 0.0, 0.0, 0.0, 1.0])
+            p[i] += step
+            column = (how(p).of(own).toDynamicParameters() - base) / step
+            units.append(_inertial_response(structure, joint, pin.SE3.Identity(), column, plane, group, solution))
+        return units
 
     return Hypothesis(
         "link_inertia",
         link,
         joint_index,
         "model",
-        (Parameter("scale", "1", 0.05, 20.0, log=True, step=1e-4),),
+        (
+            Parameter("mass", "1", 0.05, 20.0, log=True, step=1e-4, center=1.0, spread=0.5),
+            Parameter("com_x", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1),
+            Parameter("com_y", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1),
+            Parameter("com_z", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1),
+            Parameter("inertia", "1", 0.02, 50.0, log=True, step=1e-3, center=1.0, spread=0.5),
+        ),
         None,
         lambda scale: [()],
         None,
-        "The mass and inertia of {joint} are {scale:.4g} times those of the model.",
+        "The body of {joint} is not that of the model: its mass is {mass:.3g} times, its inertia {inertia:.3g} times"
+        " what the model says, its centre of mass off by ({com_x:.3g}, {com_y:.3g}, {com_z:.3g}) m.",
         variable="posture",
         options={
-            "change": change,
+            "change": lambda p: Change(links=((link, how(p)),)),
             "responses": responses,
-            "start": lambda c: np.array([np.clip(1.0 + c[0], 0.2, 5.0)]),
+            "start": lambda c: np.array(
+                [np.clip(1.0 + c[0], 0.3, 4.0), *np.clip(c[1:4], -0.2, 0.2), np.clip(1.0 + c[4], 0.3, 4.0)]
+            ),
         },
     )
 

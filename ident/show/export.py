@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import tomlkit
 
-from ident.graybox import build_structure, parameter_unit
+from ident.graybox import LinkChange, build_structure, parameter_unit
 from ident.show.figures import unit_suffix
 from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
@@ -79,12 +79,9 @@ def build_mjcf(robot: Robot, parameters: dict[str, float], causes: Sequence[Caus
     )
     hidden = tuple(_hidden_hinge(i, c) for i, c in enumerate(causes) if c.effect.endswith("_elasticity"))
     loads = tuple(_payload(robot, c) for c in causes if c.effect == "payload")
-    scales: dict[str, float] = {}
-    for c in causes:
-        if c.effect == "link_inertia":
-            scales[c.joint] = scales.get(c.joint, 1.0) * c.parameters["scale"].value
+    links = {c.joint: _link_change(c) for c in causes if c.effect == "link_inertia"}
     arm = replace(robot, elasticities=hinges)
-    structure = build_structure(arm, elasticities=hidden, loads=loads, scale_links=scales)
+    structure = build_structure(arm, elasticities=hidden, loads=loads, links=links)
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
     spec.compiler.degree = False  # else angles such as springref are taken as degrees
@@ -116,7 +113,12 @@ def _hidden_hinge(index: int, cause: Cause) -> Elasticity:
 def _payload(robot: Robot, cause: Cause) -> tuple[str, pin.Inertia]:
     p = {k: v.value for k, v in cause.parameters.items()}
     com = np.array([p["com_x"], p["com_y"], p["com_z"]])
-    return robot.payload_link, pin.Inertia(p["mass"], com, np.zeros((3, 3)))
+    return robot.payload_link, pin.Inertia(p["mass"], com, p.get("inertia", 0.0) * np.eye(3))
+
+
+def _link_change(cause: Cause) -> LinkChange:
+    p = {k: v.value for k, v in cause.parameters.items()}
+    return LinkChange(p["mass"], (p["com_x"], p["com_y"], p["com_z"]), p["inertia"])
 
 
 def _add_bodies(spec: mujoco.MjSpec, model: pin.Model, springs: dict[str, Elasticity]) -> None:

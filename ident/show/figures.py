@@ -47,6 +47,7 @@ STYLE = {
 }
 POINTS = 1500
 CURVE = 300
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def unit_suffix(unit: str) -> str:
@@ -62,7 +63,7 @@ def rounded(value: float, std: float) -> str:
     if not 1e-3 <= size < 1e6:
         power = int(np.floor(np.log10(size)))
         decimals = max(0, power - int(np.floor(np.log10(std))) + 1)
-        return f"({value / 10.0**power:.{decimals}f} ± {std / 10.0**power:.{decimals}f})·10^{power}"
+        return f"({value / 10.0**power:.{decimals}f} ± {std / 10.0**power:.{decimals}f})·10{str(power).translate(SUPERSCRIPT)}"
     decimals = max(0, 1 - int(np.floor(np.log10(std))))
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
@@ -88,7 +89,7 @@ def _draw_response(
     gain, std = np.abs(view.measured[entry]), view.measured_std[entry]
     ax.loglog(f, gain, ".", ms=size, mew=0, color=ink[MEASURED], label="measured")
     ax.loglog(f, np.abs(view.baseline[entry]), color=ink[BEFORE], lw=0.9, label="baseline")
-    ax.loglog(f, np.abs(view.extended[entry]), color=ink[AFTER], lw=0.9, label="extended, linear part")
+    ax.loglog(f, np.abs(view.extended[entry]), color=ink[AFTER], lw=0.9, label="extended")
     ax.loglog(f, np.maximum(std, 1e-12), color=ink[SOFT], lw=0.8, ls=":", label="σ of the measurement")
     seen = gain[np.isfinite(gain) & (gain > 0)]
     if len(seen):

@@ -39,7 +39,7 @@ def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, N m")]
     torques += [rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, N m") for name in joints]
     responses = [
-        rrb.Spatial2DView(origin="frf", name=f"FRF at {view.operating_point}, linear part") for view in diagnosis.frf[:1]
+        rrb.Spatial2DView(origin="frf", name=f"FRF at {view.operating_point}") for view in diagnosis.frf[:1]
     ]
     left = rrb.Vertical(
         rrb.TextDocumentView(origin="verdict", name="verdict"),

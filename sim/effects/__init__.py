@@ -151,6 +151,11 @@ def draw_effect(
     side = rng.permutation(np.eye(3))[0]
     periods = float(rng.choice([2.0, 4.0])) * joint.gear_ratio / float(rng.choice([1.0, 2.0]))
     k = joint.stiffness
+    wrong_link: dict[str, object] = {"mass": 1 + 0.15 * size}
+    if rng.random() < 0.7:
+        wrong_link["inertia"] = 1 + 0.15 * size
+    if rng.random() < 0.5:
+        wrong_link["com"] = tuple(float(v) for v in 0.02 * size * side)
     draws: dict[str, dict[str, object]] = {
         "coulomb_friction": {"torque": torque, "asymmetry": float(rng.uniform(-0.2, 0.2))},
         "stribeck_friction": {"coulomb": torque, "static": 2 * torque, "stribeck_velocity": 0.03},
@@ -169,7 +174,7 @@ def draw_effect(
         "transmission_error": {"amplitude": 0.3 * torque / k, "periods_per_rev": periods, "phase": phase},
         "joint_coupling": {"ratio": 0.1 * size},
         "payload": {"mass": 1.5 * size, "com_x": 0.02, "com_y": 0.0, "com_z": 0.08},
-        "link_inertia": {"mass": 1 + 0.15 * size, "inertia": 1 + 0.15 * size},
+        "link_inertia": wrong_link,
         "transverse_elasticity": {"stiffness": 0.7 * k / size, "damping": 6e-4 * k, "axis": tuple(float(v) for v in side)},
         "base_elasticity": {"stiffness": 10 * k / size, "damping": 6e-3 * k, "axis": (1.0, 0.0, 0.0)},
         "gravity_spring": {"stiffness": 0.1 * joint.torque_limit * size, "rest_angle": float(rng.uniform(-1, 1))},

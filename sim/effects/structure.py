@@ -34,17 +34,22 @@ class Payload:
 
 @dataclass(frozen=True)
 class LinkInertia:
-    """Mass and inertia of a link are multiples of those of its description."""
+    """Mass and inertia of a link are multiples of those of its description, its centre of mass is shifted.
+
+    ``com`` in the frame of the link, m; ``inertia`` is the factor on that about the centre of mass.
+    """
 
     place: str
     mass: float = 1.0
     inertia: float = 1.0
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
     name = "link_inertia"
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
         body = spec.body(f"body:{self.place}")
         body.mass = float(body.mass) * self.mass
         body.inertia = np.asarray(body.inertia) * self.inertia
+        body.ipos = np.asarray(body.ipos) + np.asarray(self.com)
 
 
 @dataclass(frozen=True)

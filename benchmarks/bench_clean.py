@@ -1,0 +1,85 @@
+"""Nothing hidden: errors and intervals of the identified drives, and how often something is seen.
+
+Drives are drawn within a factor of two of the nominal, postures and excitation by the seed.
+
+    python benchmarks/bench_clean.py --draws 100 --out benchmarks/results/clean.txt
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from blind import draw_case
+
+from ident.attribute import DETECTION_EXCESS, DETECTION_LEVEL, discrepancy_p_value
+from ident.dataset_io import load_dataset, save_dataset
+from ident.diagnose import UNDETERMINED, identify
+
+KINDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Relative errors and standard deviations (4 n,) in the order of ``KINDS``, and the test for more than noise."""
+
+    seed: int
+    error: np.ndarray
+    std: np.ndarray
+    chi2_per_dof: float
+    seen: bool
+
+
+def run_draw(seed: int) -> Draw:
+    """Draw, simulate, write, read, identify."""
+    case = draw_case(seed, (), 0, "ur10")
+    with tempfile.TemporaryDirectory() as folder:
+        save_dataset(case.simulate(), Path(folder) / "d")
+        _, result = identify(load_dataset(Path(folder) / "d"))
+    truth = np.concatenate([case.drives[k] for k in KINDS])
+    error = np.exp(result.model.par.to_log()) / truth - 1.0
+    std = np.sqrt(np.diag(result.covariance()))[: len(truth)]
+    seen = discrepancy_p_value(result) < DETECTION_LEVEL and result.chi2_per_dof > DETECTION_EXCESS
+    return Draw(seed, error, std, result.chi2_per_dof, seen)
+
+
+def table(draws: list[Draw]) -> str:
+    """Figures over all draws as text."""
+    error, std = np.stack([d.error for d in draws]), np.stack([d.std for d in draws])
+    known = std < UNDETERMINED
+    covered = np.abs(error) < 1.96 * std
+    rows = [f"{len(draws)} draws, seeds {draws[0].seed} to {draws[-1].seed}, nothing hidden"]
+    for k, part in zip(KINDS, np.split(np.arange(error.shape[1]), len(KINDS)), strict=True):
+        e, ok = np.abs(error[:, part]), known[:, part]
+        rows.append(
+            f"{k:17s} median error {np.median(e):.2%}, 99 % within {np.quantile(e[ok], 0.99):.2%}, largest"
+            f" {e[ok].max():.2%} where determined ({ok.mean():.1%}); 95 % intervals cover {covered[:, part].mean():.1%}"
+        )
+    chi2 = np.array([d.chi2_per_dof for d in draws])
+    rows.append(f"all intervals together cover {covered.mean():.1%}")
+    rows.append(f"chi2 per degree of freedom {chi2.min():.3f} to {chi2.max():.3f}")
+    rows.append(f"nothing beyond noise in {sum(not d.seen for d in draws)} of {len(draws)}")
+    return "\n".join(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=5000)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    with ProcessPoolExecutor(args.workers) as executor:
+        draws = list(executor.map(run_draw, range(args.seed, args.seed + args.draws)))
+    text = table(draws)
+    print(text)
+    if args.out:
+        args.out.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
