@@ -23,6 +23,7 @@ from ident.graybox import (
     stiffness_diagonal,
 )
 from ident.inverse import Sampling
+from ident.link_sensor import LinkDelay, find_link_delays
 from ident.noise import sample_noise
 from ident.parallel import map_threads, one_thread_each
 from ident.quantization import Steps, find_steps
@@ -178,7 +179,8 @@ def diagnose_fully(
         pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
     say("evidence")
     last = predictions(problem, after, result.final.remainders)
-    verdict = make_verdict(dataset, setup, result, gain, first, last)
+    late = find_link_delays(problem, last)
+    verdict = make_verdict(dataset, setup, result, gain, first, last, late)
     kept = result.rounds if len(verdict.causes) else ()
     return Diagnosis(
         verdict=verdict,
@@ -235,6 +237,7 @@ def make_verdict(
     gain: Gain | None,
     first: Sequence[Prediction],
     last: Sequence[Prediction],
+    late: Sequence[LinkDelay] = (),
 ) -> Verdict:
     """Put the result into the words and numbers of verdict.json."""
     final = result.final
@@ -253,10 +256,14 @@ def make_verdict(
     for effect in final.model.effects:
         found = rounds[effect.hypothesis.key]
         causes.append(_cause(effect, found.candidates, final, covariance, trust * explained_share(found, final)))
-    causes += [_rounded(x, dataset.joints[x.joint]) for x in setup.steps]
-    detected = result.detected or bool(setup.steps)
+    direct = [_rounded(x, dataset.joints[x.joint]) for x in setup.steps]
+    direct += [_late(x, dataset.joints[x.joint]) for x in late]
+    causes += direct
+    detected = result.detected or bool(direct)
     seen = where(setup.problem, result.baseline, first) if result.detected else ()
-    seen += tuple(Where(dataset.joints[x.joint], "q", "position in steps", 1.0) for x in setup.steps if not seen)
+    if not seen:
+        seen += tuple(Where(dataset.joints[x.joint], "q", "position in steps", 1.0) for x in setup.steps)
+        seen += tuple(Where(dataset.joints[x.joint], "q_link", "position that follows the velocity", 1.0) for x in late)
     verdict = "unknown cause remains" if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)
     description = describe(setup.problem, final, last) if unknown else None
@@ -265,7 +272,7 @@ def make_verdict(
         baseline=values,
         discrepancy=Discrepancy(
             detected,
-            0.0 if setup.steps else result.p_value,
+            0.0 if direct else result.p_value,
             result.baseline.chi2_per_dof,
             seen,
         ),
@@ -289,6 +296,20 @@ def _rounded(steps: Steps, joint: str) -> Cause:
         probability=0.99,
         evidence=f"The position of {joint} takes steps of {steps.resolution:.3g} rad: its samples lie on a grid.",
         alternatives=(),
+    )
+
+
+def _late(late: LinkDelay, joint: str) -> Cause:
+    """The cause of a link encoder that lags the motor encoder: the torque equation does not hold it."""
+    return Cause(
+        effect="sensor_delay",
+        joint=joint,
+        parameters={"delay": Value(late.delay, late.std, "s")},
+        probability=0.95,
+        evidence=f"The link encoder of {joint} comes {late.delay:.3g} s after its motor encoder: their difference"
+        " follows the velocity, which looks like wind-up of the gear and is not.",
+        alternatives=(),
+        channel="q_link",
     )
 
 
@@ -336,6 +357,7 @@ def _cause(
         alternatives=tuple(
             Alternative(e, p, float(v * trust)) for (e, p), v in sorted(others.items(), key=lambda x: -x[1])
         ),
+        channel="q" if h.channel == "position" else None,
     )
 
 

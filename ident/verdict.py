@@ -34,7 +34,10 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Cause:
-    """A named effect at a place ("flange" and "base" are places too)."""
+    """A named effect at a place ("flange" and "base" are places too).
+
+    ``channel``: "q" or "q_link" for effects of a position channel, else None.
+    """
 
     effect: str
     joint: str
@@ -42,6 +45,7 @@ class Cause:
     probability: float
     evidence: str
     alternatives: tuple[Alternative, ...]
+    channel: str | None = None
 
 
 @dataclass(frozen=True)

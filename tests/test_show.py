@@ -243,6 +243,6 @@ def test_a_failing_run_harms_no_earlier_output(diagnosis, tmp_path, monkeypatch)
 
 def test_numbers_are_rounded_to_their_standard_deviation():
     assert rounded(5.27081, 0.0036) == "5.2708 ± 0.0036"
-    assert rounded(2.9e-05, 3.8e-05) == "(2.9 ± 3.8)·10^-5"
+    assert rounded(2.9e-05, 3.8e-05) == "(2.9 ± 3.8)·10⁻⁵"
     assert rounded(1.0, 0.0) == "1"
     assert rounded(1.5, float("nan")) == "1.5 ± nan"
