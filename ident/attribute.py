@@ -17,7 +17,7 @@ import scipy.stats
 
 from ident.extended import Effect, Model, Prediction
 from ident.graybox import parameter_names
-from ident.hypotheses import Hypothesis, catalogue
+from ident.hypotheses import Hypothesis, Parameter, catalogue
 from ident.parallel import map_threads
 from ident.screening import Score, screen
 from ident.torque_fit import (
@@ -39,19 +39,22 @@ HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
+GEAR_STEPS = 10  # the same of a law of the gear
+ANSWERED = 0.2  # share of the excess that the best may leave where no law of the gear is tried beyond the screened ones
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
 POLISH_STEPS = 40  # of the winner of a round
 PER_EFFECT = 2  # of one effect, at most
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
+ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
 MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
-NATS_PER_PARAMETER = 2.0
+POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found absent
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
-WORTH_A_REFIT = 0.15  # the same for a screened gain: linear steps understate strong effects
+WORTH_A_REFIT = 0.05  # the same for a screened gain: linear steps understate strong effects
 
 
 @dataclass(frozen=True)
@@ -229,8 +232,7 @@ def attribute_once(
     if level > 0:
         preds = predictions(problem, stage.model, stage.remainders)
         sharp = make_weights(problem, preds, 0.0)
-        unextended = predictions(problem, current.model, current.remainders)
-        before = replace(current, cost=weighted_cost(problem, unextended, sharp), weights=sharp)
+        before = reweighted(problem, current, sharp)
         ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
         ways = [(h, r, (*ladder, sharp)) for h, r in found[:FINALISTS]]
         if current.chi2_per_dof < HOPELESS:
@@ -252,9 +254,39 @@ def attribute_once(
             best[id(h)] = h, result
     if not best:
         return Round(before, (), tuple(scores), 1.0)
-    weighed = weigh([Candidate(h, result, 0.0) for h, result in best.values()], before.count)
-    scale = max(1.0, min(r.cost for _, r in best.values()) / before.count)
+    ranked = sorted(best.values(), key=lambda x: x[1].cost)
+    before, ranked = under_noise_of_best(problem, before, ranked)
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in ranked], before.count)
+    scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     return Round(before, tuple(weighed), tuple(scores), scale)
+
+
+def under_noise_of_best(
+    problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
+    """Candidates, and the model without them, under the noise that the best of them sees.
+
+    Noise of the position reaches the torque through the laws of effects; weights without them would
+    take it for model error.
+
+    Args:
+        ranked: candidates, best first; the first ``FINALISTS`` are fitted again.
+    """
+    top = ranked[0][1]
+    weights = make_weights(problem, predictions(problem, top.model, top.remainders), 0.0)
+
+    def moved(candidate: tuple[int, tuple[Hypothesis, Fit]]) -> tuple[Hypothesis, Fit]:
+        place, (h, r) = candidate
+        again = refit(problem, r.model, weights, r.remainders) if place < FINALISTS else None
+        return h, again or reweighted(problem, r, weights)
+
+    return reweighted(problem, before, weights), map_threads(moved, enumerate(ranked))
+
+
+def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
+    """A fit as it stands, its cost under other weights."""
+    preds = predictions(problem, result.model, result.remainders)
+    return replace(result, cost=weighted_cost(problem, preds, weights), weights=weights)
 
 
 def explore(
@@ -274,21 +306,28 @@ def explore(
     excess = max(stage.cost - stage.count, 1.0)
     if not scores or not (regardless or scores[0].gain > WORTH_A_REFIT * excess):
         return [], scores
-    chosen = with_gear_laws(problem, stage, preds, choose(scores), scores)
 
-    def first_steps(score: Score) -> tuple[Hypothesis, Fit | None]:
+    def started(task: tuple[Score, int]) -> tuple[Hypothesis, Fit | None]:
+        score, steps = task
         h = score.hypothesis
         if progress is not None:
             progress(f"refit: {h.effect} at {h.place}")
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
-        return h, refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
+        return h, refit(problem, model, stage.weights, stage.remainders, steps)
+
+    def first_steps(chosen: Sequence[Score], steps: int) -> list[tuple[Hypothesis, Fit]]:
+        return [(h, r) for h, r in map_threads(started, [(score, steps) for score in chosen]) if r is not None]
 
     def finished(candidate: tuple[Hypothesis, Fit]) -> tuple[Hypothesis, Fit]:
         h, r = candidate
         return h, r if r.converged else refit(problem, r.model, stage.weights, r.remainders) or r
 
-    found = hopeful([(h, r) for h, r in map_threads(first_steps, chosen) if r is not None])
-    found = map_threads(finished, found)
+    chosen = choose(scores)
+    found = first_steps(chosen, FIRST_STEPS)
+    left = min((r.cost - r.count for _, r in found), default=np.inf)
+    if left > ANSWERED * excess:
+        found += first_steps(gear_laws(problem, stage, preds, scores), GEAR_STEPS)
+    found = map_threads(finished, hopeful(found))
     return sorted(found, key=lambda x: x[1].cost), scores
 
 
@@ -333,30 +372,28 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     return out
 
 
-def with_gear_laws(
-    problem: Problem, stage: Fit, preds: Sequence[Prediction], chosen: list[Score], scores: Sequence[Score]
+def gear_laws(
+    problem: Problem, stage: Fit, preds: Sequence[Prediction], scores: Sequence[Score]
 ) -> list[Score]:
-    """The laws of the gear at the joint that carries most of the discrepancy, and the candidates.
+    """The laws of the gear at the joint that carries most of the discrepancy, each from a size of its own.
 
-    A gear that stiffens or softens moves its resonance with the amplitude; the linear step of a
-    score says little about that, so these laws are fitted from a size of their own.
+    A gear that stiffens or softens moves its resonance with the amplitude, and its law trades with
+    stiffness along a curved valley: the linear step of a score says little about either.
     """
     excess = np.zeros(problem.structure.n)
     for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
         e = stage.weights.apply(g, residual(group, pred))
         excess += np.sum(np.abs(e) ** 2 - 2.0, axis=(0, 1))
     loudest = int(np.argmax(excess))
-    have = {s.hypothesis.key for s in chosen}
     deflection = np.sqrt(
         np.mean([np.mean(p.motion(g).delta(loudest) ** 2) for g, p in zip(problem.groups, preds, strict=True)])
     )
     stiffness = float(stage.model.par.stiffness[loudest])
-    extra = []
-    for score in scores:
-        h = score.hypothesis
-        if h.joint == loudest and h.key not in have and "size" in h.options:
-            extra.append(replace(score, start=h.options["size"](stiffness, deflection)))
-    return [*extra, *chosen]  # the longest fits first
+    return [
+        replace(s, start=s.hypothesis.options["size"](stiffness, deflection))
+        for s in scores
+        if s.hypothesis.joint == loudest and "size" in s.hypothesis.options
+    ]
 
 
 def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:
@@ -380,15 +417,15 @@ def weigh(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
 
     Under pure noise the evidence is half the difference of the costs. What the best model leaves
     above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
-    difference counts only against ``TEMPER + MODEL_ERROR_SHARE x excess``. Parameters cost
-    ``NATS_PER_PARAMETER`` each, so that of two names for the same torque the simpler one wins.
+    difference counts only against ``TEMPER + MODEL_ERROR_SHARE x excess``. Parameters count by how far
+    the data narrow them down (``occam``).
     """
     cost = np.array([c.fit.cost for c in candidates])
     excess = max(cost.min() - count, 0.0)
-    complexity = np.array([c.hypothesis.complexity for c in candidates])
     decoy = np.array([c.hypothesis.decoy for c in candidates], float)
-    evidence = -0.5 * (cost - cost.min()) / (TEMPER + MODEL_ERROR_SHARE / 6.0 * excess)
-    evidence = evidence - NATS_PER_PARAMETER * complexity - DECOY_NATS * decoy
+    temper = TEMPER + MODEL_ERROR_SHARE / 6.0 * excess
+    evidence = -0.5 * (cost - cost.min()) / temper - DECOY_NATS * decoy
+    evidence += [occam(c, temper) for c in candidates]
     evidence -= evidence.max()
     probability = np.exp(evidence) / np.exp(evidence).sum()
     out = [
@@ -396,3 +433,46 @@ def weigh(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
         for c, e, p in zip(candidates, evidence, probability, strict=True)
     ]
     return sorted(out, key=lambda c: -c.probability)
+
+
+def occam(candidate: Candidate, temper: float) -> float:
+    """Log of the share of what a hypothesis allowed beforehand that the data leave to it, at most 0.
+
+    ``-log det(1 + P L / temper) / 2`` with the spread ``P`` of its parameters before the data and their
+    information ``L`` with all other coordinates free (Laplace's approximation: MacKay, Neural Comput. 4,
+    1992), and the density of the values themselves where there is a prior. A parameter that the data do
+    not determine costs nothing, nor does one that they find absent, unless it is what makes the effect.
+    """
+    effect = candidate.fit.model.effects[-1]
+    ps = effect.hypothesis.parameters
+    H = candidate.fit.information
+    x = np.array([q.to_internal(v) for q, v in zip(ps, effect.p, strict=True)])
+    nulls = np.array([np.nan if q.null is None else q.to_internal(q.null) for q in ps])
+    std = np.sqrt(temper * np.diag(_inverse(H))[-len(ps) :])
+    absent = np.abs(x - nulls) < ABSENT * std
+    keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
+    count = int(np.sum(~absent))
+    options = effect.hypothesis.options
+    pointless = any(a and q.name == options.get("essential") for q, a in zip(ps, absent, strict=True))
+    pointless = pointless or options.get("trivial", lambda p: False)(effect.p)
+    if count == 0:
+        return -POINTLESS_NATS * pointless
+    own = np.linalg.inv(_inverse(H[np.ix_(keep, keep)])[-count:, -count:])
+    amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in ("sine", "cosine"))) if _wave(ps) else 0.0
+    spread = np.array(
+        [q.expected_spread(amplitude if q.name in ("sine", "cosine") else v) for q, v in zip(ps, effect.p, strict=True)]
+    )[~absent]
+    narrowed = np.linalg.slogdet(np.eye(count) + own * np.outer(spread, spread) / temper)[1]
+    stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
+    density = sum(((v - q.prior_center(stiffness)) / q.spread) ** 2 for q, v in zip(ps, x, strict=True))
+    return float(-0.5 * narrowed - 0.5 * density - POINTLESS_NATS * pointless)
+
+
+def _wave(parameters: Sequence[Parameter]) -> bool:
+    return {"sine", "cosine"} <= {q.name for q in parameters}
+
+
+def _inverse(H: np.ndarray) -> np.ndarray:
+    """Inverse of an information matrix, steadied where coordinates are not determined."""
+    size = np.sqrt(np.maximum(np.diag(H), 1e-30))
+    return np.linalg.inv(H / np.outer(size, size) + 1e-9 * np.eye(len(H))) / np.outer(size, size)

@@ -371,7 +371,12 @@ def _prior(problem: Problem, model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Centre and weight (inverse variance) of the weak prior of each fitted coordinate."""
     ps = [q for effect in model.effects for q in effect.hypothesis.parameters]
     baseline = problem.nominal.to_log()
-    center = np.concatenate([baseline, [0.0], [q.to_internal(q.center) if np.isfinite(q.spread) else 0.0 for q in ps]])
+    centers = [
+        q.prior_center(problem.nominal.stiffness[effect.hypothesis.joint])
+        for effect in model.effects
+        for q in effect.hypothesis.parameters
+    ]
+    center = np.concatenate([baseline, [0.0], centers])
     timing = (PRIOR_TIMING * problem.sampling.sample_time) ** -2
     return center, np.concatenate([np.full(len(baseline), PRIOR_LOG_STD**-2), [timing], [q.spread**-2 for q in ps]])
 

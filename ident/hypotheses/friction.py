@@ -45,7 +45,7 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
         "motor",
         (
             Parameter("torque", "N m", 1e-9, 1e7, log=True),
-            Parameter("asymmetry", "1", -0.95, 0.95),
+            Parameter("asymmetry", "1", -0.95, 0.95, null=0.0),
             SMOOTHING,
         ),
         law,
@@ -88,7 +88,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
         (
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
             Parameter("static", "N m", 1e-9, 1e7, log=True),
-            Parameter("stribeck_velocity", "rad/s", 1e-6, 1e2, log=True, step=1e-2),
+            Parameter("stribeck_velocity", "rad/s", 1e-6, 1e2, True, step=1e-2, center=0.05, spread=1.2),
             SMOOTHING,
         ),
         law,
@@ -96,7 +96,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
         screen,
         "The residual torque of {joint} falls from {static:.3g} N m at rest to {coulomb:.3g} N m above"
         " {stribeck_velocity:.2g} rad/s: friction with a Stribeck dip.",
-        options={"absorbs": "coulomb_friction", "absorb": absorb},
+        options={"absorbs": "coulomb_friction", "absorb": absorb, "trivial": lambda p: p[1] < 1.15 * p[0]},
     )
 
 
@@ -190,7 +190,7 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         joint,
         "motor",
         (
-            Parameter("relative_change", "1", -0.98, 5.0, step=1e-3),
+            Parameter("relative_change", "1", -0.98, 5.0, step=1e-3, center=0.0, spread=0.5, null=0.0),
             Parameter("time_constant", "s", 1.0, 1e5, log=True, step=1e-2),
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True),
             Parameter("viscous", "N m s/rad", 1e-9, 1e7, log=True, nuisance=True),
@@ -202,7 +202,7 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
         " of {time_constant:.0f} s.",
         variable="time",
-        options={"absorbs": "coulomb_friction", "absorb": absorb},
+        options={"absorbs": "coulomb_friction", "absorb": absorb, "essential": "relative_change"},
     )
 
 

@@ -9,6 +9,9 @@ import numpy as np
 
 from ident.inverse import Motion
 
+LOG_SPREAD = 1.5  # of a positive parameter before the data, natural logarithm
+UNIT_RANGE = 4.0  # between bounds that are physical ones of a pure number
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -21,6 +24,8 @@ class Parameter:
         nuisance: fitted but not reported.
         step: finite-difference step in fitted coordinates.
         center, spread: a weak prior, external units, the spread in fitted coordinates; none where infinite.
+        per_stiffness: ``center`` is in units of the stiffness of the joint's gear.
+        null: value at which the parameter is as good as absent, None where there is no such value.
     """
 
     name: str
@@ -32,6 +37,14 @@ class Parameter:
     step: float = 1e-4
     center: float = 0.0
     spread: float = np.inf
+    per_stiffness: bool = False
+    null: float | None = None
+
+    def prior_center(self, stiffness: float) -> float:
+        """Centre of the weak prior in fitted coordinates, 0 where there is none."""
+        if not np.isfinite(self.spread):
+            return 0.0
+        return self.to_internal(self.center * stiffness if self.per_stiffness else self.center)
 
     def to_internal(self, value: float) -> float:
         value = float(np.clip(value, self.lower, self.upper))
@@ -40,6 +53,16 @@ class Parameter:
     def to_external(self, x: float) -> float:
         value = float(np.exp(np.clip(x, -700, 700))) if self.log else x
         return float(np.clip(value, self.lower, self.upper))
+
+    def expected_spread(self, value: float) -> float:
+        """Standard deviation before the data, fitted coordinates: of the size of the value where nothing is said."""
+        if np.isfinite(self.spread):
+            return self.spread
+        if self.log:
+            return LOG_SPREAD
+        if self.upper - self.lower <= UNIT_RANGE:
+            return (self.upper - self.lower) / np.sqrt(12.0)
+        return max(abs(value), 1e-300)
 
 
 @dataclass(frozen=True)
@@ -79,8 +102,8 @@ class Hypothesis:
         sentence: evidence with {joint} and the parameters as fields.
         options: what single hypotheses need beyond that. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
-            place of one with parameters ``old`` at the same joint. ``minor`` parameters, the last ones, do not
-            count against it.
+            place of one with parameters ``old`` at the same joint. ``essential`` names the parameter without
+            which nothing is left of the effect, ``trivial(p)`` says so of all parameters together.
     """
 
     effect: str
@@ -98,11 +121,6 @@ class Hypothesis:
     @property
     def decoy(self) -> bool:
         return self.effect.startswith("unknown:")
-
-    @property
-    def complexity(self) -> int:
-        """Parameters that count against a hypothesis when it is weighed."""
-        return len(self.parameters) - self.options.get("minor", 0)
 
     @property
     def key(self) -> tuple[str, str]:

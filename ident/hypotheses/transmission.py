@@ -83,7 +83,7 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         joint,
         "spring",
         (
-            Parameter("low_stiffness", "N m/rad", 1e-3, 1e12, log=True, step=1e-2),
+            Parameter("low_stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=0.8, per_stiffness=True),
             Parameter("transition", "rad", 1e-9, 1.0, log=True, step=1e-2),
         ),
         lambda p, delta, k: (kernels.SOFTENING, min(p[0], k), p[1], k),
@@ -111,7 +111,7 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
         joint,
         "spring",
         (
-            Parameter("stiffness", "N m/rad", 1e-3, 1e12, log=True, step=1e-2),
+            Parameter("stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=1.5, per_stiffness=True),
             Parameter("yield_torque", "N m", 1e-9, 1e7, log=True, step=1e-2),
         ),
         lambda p, delta, k: (kernels.HYSTERESIS, p[0], p[1], k),
@@ -120,6 +120,7 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
         "The torque of {joint} makes loops against the gear's deflection: an element of {stiffness:.3g} N m/rad"
         " that yields at {yield_torque:.3g} N m.",
         variable="delta",
+        options={"size": lambda k, delta: np.array([0.4 * k, 0.2 * k * delta])},
     )
 
 
@@ -159,7 +160,7 @@ def transmission_error(joint: int, place: str) -> Hypothesis:
             Parameter("sine", "rad", -0.1, 0.1, step=1e-7),
             Parameter("periods_per_rev", "1", 0.3, 1e5, step=1e-3),
             Parameter("cosine", "rad", -0.1, 0.1, step=1e-7),
-            Parameter("reaction", "1", -0.5, 1.5, nuisance=True, step=1e-2),
+            Parameter("reaction", "1", -0.5, 1.5, nuisance=True, step=1e-2, null=1.0),
         ),
         lambda p, motion, j, k: parts(p, motion, j),
         lambda scale: [(n, 1.0) for n in scale.wave_numbers],
