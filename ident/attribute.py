@@ -41,6 +41,8 @@ FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 GEAR_STEPS = 10  # the same of a law of the gear
 ANSWERED = 0.2  # share of the excess that the best may leave where no law of the gear is tried beyond the screened ones
+SETTLED = 0.05  # share of the excess up to which what is left needs no second search
+HOPEFUL = 5  # candidates fitted further after the first steps
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
@@ -200,10 +202,8 @@ def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
 
     A strong cause drives the baseline far from the truth, to where no step along a single
     hypothesis leads back. With an error relative to the torque added to the noise the baseline
-    stays near, and hypotheses can be compared. A model near the noise is returned as it is.
+    stays near, and hypotheses can be compared.
     """
-    if current.chi2_per_dof <= STRONG:
-        return current, 0.0
     names = parameter_names(problem.structure.robot)
     model, best, level = replace(current.model, par=problem.nominal), None, 0.0
     for rho in ANNEALING[:-1]:
@@ -223,31 +223,18 @@ def attribute_once(
 ) -> Round:
     """One round: screen all, refit the best, weigh them.
 
-    Of a strong discrepancy candidates are sought on two ways, from the softened model and from the
-    model as it stands: a cause may have spoilt either. All are compared under the same weights.
+    A strong cause may have spoilt the model from which others are sought, so that none of them answers;
+    candidates are then also sought from a softened model. All are compared under the same weights.
     """
-    stage, level = soften(problem, current)
-    found, scores = explore(problem, stage, hypotheses, level > 0, progress)
     before = current
-    if level > 0:
-        preds = predictions(problem, stage.model, stage.remainders)
-        sharp = make_weights(problem, preds, 0.0)
-        before = reweighted(problem, current, sharp)
-        ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
-        ways = [(h, r, (*ladder, sharp)) for h, r in found[:FINALISTS]]
-        if current.chi2_per_dof < HOPELESS:
-            direct, _ = explore(problem, current, hypotheses, True, progress)
-            ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
-
-        def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> tuple[Hypothesis, Fit]:
-            h, result, steps = way
-            if progress is not None:
-                progress(f"finalist: {h.effect} at {h.place}")
-            for weights in steps:
-                result = refit(problem, result.model, weights, result.remainders) or result
-            return h, result
-
-        found = [(h, r) for h, r in map_threads(sharpened, ways) if r.weights is sharp]
+    if current.chi2_per_dof < HOPELESS:
+        found, scores = explore(problem, current, hypotheses, current.chi2_per_dof > STRONG, progress)
+    else:
+        found, scores = [], []
+    excess = max(current.cost - current.count, 1.0)
+    left = min((r.cost - r.count for _, r in found), default=np.inf)
+    if current.chi2_per_dof > STRONG and left > SETTLED * excess:
+        before, found, scores = explore_softly(problem, current, found, hypotheses, progress)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
         if id(h) not in best or result.cost < best[id(h)][1].cost:
@@ -259,6 +246,38 @@ def attribute_once(
     weighed = weigh([Candidate(h, result, 0.0) for h, result in ranked], before.count)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     return Round(before, tuple(weighed), tuple(scores), scale)
+
+
+def explore_softly(
+    problem: Problem,
+    current: Fit,
+    direct: Sequence[tuple[Hypothesis, Fit]],
+    hypotheses: Sequence[Hypothesis],
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]], list[Score]]:
+    """Candidates sought from a softened model, and those found ``direct``, under weights of the former.
+
+    Returns:
+        The model without a new cause under these weights, candidates and scores.
+    """
+    stage, level = soften(problem, current)
+    found, scores = explore(problem, stage, hypotheses, True, progress, rough=True)
+    preds = predictions(problem, stage.model, stage.remainders)
+    sharp = make_weights(problem, preds, 0.0)
+    ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
+    ways = [(h, r, (*ladder, sharp)) for h, r in found[:FINALISTS]]
+    ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
+
+    def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> tuple[Hypothesis, Fit]:
+        h, result, steps = way
+        if progress is not None:
+            progress(f"finalist: {h.effect} at {h.place}")
+        for weights in steps:
+            result = refit(problem, result.model, weights, result.remainders) or result
+        return h, result
+
+    finalists = [(h, r) for h, r in map_threads(sharpened, ways) if r.weights is sharp]
+    return reweighted(problem, current, sharp), finalists, scores
 
 
 def under_noise_of_best(
@@ -295,11 +314,14 @@ def explore(
     hypotheses: Sequence[Hypothesis],
     regardless: bool,
     progress: Callable[[str], None] | None = None,
+    *,
+    rough: bool = False,
 ) -> tuple[list[tuple[Hypothesis, Fit]], list[Score]]:
     """Candidates fitted under the weights of ``stage``, best first, and all scores.
 
     Args:
         regardless: refit also where no linear step explains much.
+        rough: the first steps are enough where they answer: the candidates are fitted again.
     """
     preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
@@ -324,10 +346,12 @@ def explore(
 
     chosen = choose(scores)
     found = first_steps(chosen, FIRST_STEPS)
-    left = min((r.cost - r.count for _, r in found), default=np.inf)
-    if left > ANSWERED * excess:
+    answered = min((r.cost - r.count for _, r in found), default=np.inf) < ANSWERED * excess
+    if not answered:
         found += first_steps(gear_laws(problem, stage, preds, scores), GEAR_STEPS)
-    found = map_threads(finished, hopeful(found))
+    found = hopeful(found)
+    if not (rough and answered):
+        found = map_threads(finished, found)
     return sorted(found, key=lambda x: x[1].cost), scores
 
 
@@ -336,7 +360,7 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
     ranked = sorted(found, key=lambda x: x[1].cost)
     limit = HOPELESS_RATIO * max(ranked[0][1].cost - ranked[0][1].count, 0.0) if ranked else 0.0
     return [
-        (h, r) for i, (h, r) in enumerate(ranked) if i < FINALISTS or (r.cost - r.count < limit and not r.converged)
+        (h, r) for i, (h, r) in enumerate(ranked[:HOPEFUL]) if i < FINALISTS or (r.cost - r.count < limit and not r.converged)
     ]
 
 

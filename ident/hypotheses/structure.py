@@ -5,6 +5,7 @@ Those on channel "model" change the gray-box itself; ``Change`` says how.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -150,10 +151,8 @@ def payload(link: str) -> Hypothesis:
 
     def responses(structure, par, plane, group, solution, shape):
         joint, placement = structure.bodies[link]
-        units = []
-        for column in np.eye(4):
-            units.append(_inertial_response(structure, joint, placement, column, plane, group, solution))
-        return units
+        columns = [_move(np.append(unit, np.zeros(6)), placement) for unit in np.eye(4)]
+        return _inertial_responses(structure, joint, columns, plane, group, solution)
 
     def start(c):
         if c[0] <= 0:
@@ -197,13 +196,9 @@ def link_inertia(link: str, joint_index: int) -> Hypothesis:
         bare = build_structure(structure.robot, links=structure.links)
         own = bare.model.inertias[bare.bodies[link][0]]
         base = own.toDynamicParameters()
-        units = []
-        for i, step in enumerate(LINK_STEPS):
-            p = np.array([1.0, 0.0, 0.0, 0.0, 1.0])
-            p[i] += step
-            column = (how(p).of(own).toDynamicParameters() - base) / step
-            units.append(_inertial_response(structure, joint, pin.SE3.Identity(), column, plane, group, solution))
-        return units
+        changed = np.array([1.0, 0.0, 0.0, 0.0, 1.0]) + np.diag(LINK_STEPS)
+        columns = [(how(p).of(own).toDynamicParameters() - base) / h for p, h in zip(changed, LINK_STEPS, strict=True)]
+        return _inertial_responses(structure, joint, columns, plane, group, solution)
 
     return Hypothesis(
         "link_inertia",
@@ -317,33 +312,32 @@ def hinge_inertia(structure: Structure, hinge: Elasticity, group: Group, plane: 
     return float(linearise(wide, q).M[wide.elastic[-1], wide.elastic[-1]])
 
 
-def _inertial_response(
+def _inertial_responses(
     structure: Structure,
     joint: int,
-    placement: pin.SE3,
-    column: np.ndarray,
+    columns: Sequence[np.ndarray],
     plane: Plane,
     group: Group,
     solution: Solution,
-) -> np.ndarray:
-    """Recorded torque per unit of inertial parameters added to a body; (S, L, n).
+) -> list[np.ndarray]:
+    """Recorded torques (S, L, n) per unit of inertial parameters added to a body.
 
-    ``column`` holds (up to ten) dynamic parameters [m, m c, I] in the link frame; inverse dynamics
-    is linear in them, so that the response is a difference of two inverse dynamics.
+    ``columns`` hold dynamic parameters [m, m c, I] (10,) in the frame of the joint; inverse dynamics is
+    linear in them, so that a response is a difference of two inverse dynamics.
     """
-    full = np.zeros(10)
-    full[: len(column)] = column
-    added = _move(full, placement)
-    model = structure.model.copy()
-    model.inertias[joint] = pin.Inertia.FromDynamicParameters(
-        model.inertias[joint].toDynamicParameters() + added
-    )
     coarse = coarse_group(group)
     s = plane.s[:, None]
     motion = [coarse.to_time(s**k * solution.Q_a) for k in range(3)]
-    torque = inverse_dynamics(replace(structure, model=model), *motion) - inverse_dynamics(structure, *motion)
-    lines = coarse.to_lines(torque)
-    return plane.record[:, None] * np.matmul(plane.link_gain, lines[..., None])[..., 0]
+    without = inverse_dynamics(structure, *motion)
+    out = []
+    for column in columns:
+        model = structure.model.copy()
+        model.inertias[joint] = pin.Inertia.FromDynamicParameters(
+            model.inertias[joint].toDynamicParameters() + column
+        )
+        lines = coarse.to_lines(inverse_dynamics(replace(structure, model=model), *motion) - without)
+        out.append(plane.record[:, None] * np.matmul(plane.link_gain, lines[..., None])[..., 0])
+    return out
 
 
 def _move(parameters: np.ndarray, placement: pin.SE3) -> np.ndarray:
