@@ -8,6 +8,7 @@ Drives are drawn within a factor of two of the nominal, postures and excitation 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ class Draw:
 
 def run_draw(seed: int) -> Draw:
     """Draw, simulate, write, read, identify."""
-    case = draw_case(seed, (), 0, "ur10")
+    case = draw_case(seed, None, "none", "ur10")
     with tempfile.TemporaryDirectory() as folder:
         save_dataset(case.simulate(), Path(folder) / "d")
         _, result = identify(load_dataset(Path(folder) / "d"))
@@ -73,6 +74,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
+    os.environ["SIMGAP_THREADS"] = "1"
     with ProcessPoolExecutor(args.workers) as executor:
         draws = list(executor.map(run_draw, range(args.seed, args.seed + args.draws)))
     text = table(draws)

@@ -3,13 +3,17 @@
 The diagnosis sees the files of a dataset alone. Drives are drawn within a factor of two of the
 nominal; the plant's step and integrator differ from case to case.
 
-    python benchmarks/blind.py --size quick --out benchmarks/results/blind-quick.json
+    python benchmarks/blind.py --size quick --out benchmarks/results/blind-quick
+
+``--kind mix`` draws the arm as well, and none, one, two or an effect that the catalogue lacks.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
 import tempfile
 import time
 import traceback
@@ -18,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from blind_summary import pictures, table
+from outside import draw_outside
 
 from ident.dataset import Dataset
 from ident.dataset_io import load_dataset, save_dataset
@@ -30,6 +36,9 @@ from sim.experiment import draw_drives
 from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
 
 ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "hardening_stiffness", "payload")
+ARMS = ("ur10", "irb", "panda")
+KINDS = {"none": 0.15, "one": 0.5, "two": 0.2, "outside": 0.15}
+COUNTS = {"none": 0, "one": 1, "two": 2, "outside": 0}
 SIZES = {"smoke": 6, "quick": 26, "sixty": 60, "full": 400}
 
 
@@ -50,8 +59,17 @@ class Case:
         return [{"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e))} for e in self.hidden]
 
 
-def draw_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: str) -> Case:
-    """Postures, excitation, effects, sizes, drives and the plant's step, all by one seed."""
+def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: str) -> Case:
+    """Postures, excitation, effects, sizes, drives and the plant's step, all by one seed.
+
+    Args:
+        kind: of ``KINDS``, or "mix"; "mix" as ``robot_name`` draws one of ``ARMS``.
+    """
+    mixed = np.random.default_rng([seed, 1])
+    if robot_name == "mix":
+        robot_name = str(mixed.choice(ARMS))
+    if kind == "mix":
+        kind = str(mixed.choice(list(KINDS), p=list(KINDS.values())))
     rng = np.random.default_rng(seed)
     robot = load_robot(robot_name)
     pool = names or tuple(EFFECTS)
@@ -70,16 +88,18 @@ def draw_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: 
     peak = np.max([np.abs(e.r).max(axis=0) for e in plan.experiments], axis=0)
     peak = peak + np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0)
     hidden = []
-    for i in range(count):
+    if kind == "outside":
+        hidden.append(draw_outside(rng, robot, float(np.exp(rng.uniform(-0.5, 1.0)))))
+    for i in range(COUNTS[kind]):
         name = pool[(seed + i * 7) % len(pool)]
         strength = float(np.exp(rng.uniform(-0.5, 0.7)))
         hidden.append(draw_effect(rng, robot, names=(name,), strength=strength, peak_torque=peak))
     return Case(plan, hidden, draw_drives(rng, robot), float(rng.choice([2.5e-4, 2e-4])), seed)
 
 
-def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: str) -> dict:
+def run_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: str) -> dict:
     """Draw, simulate, write, read, diagnose, compare."""
-    case = draw_case(seed, names, count, robot_name)
+    case = draw_case(seed, names, kind, robot_name)
     truth = case.truth()
     began = time.perf_counter()
     try:
@@ -98,6 +118,7 @@ def run_case(seed: int, names: tuple[str, ...] | None, count: int, robot_name: s
     v = result.verdict.to_dict()
     return {
         "seed": seed,
+        "robot": case.plan.robot.name,
         "truth": truth,
         "causes": [
             {k: c[k] for k in ("effect", "joint", "probability", "alternatives", "parameters")} for c in v["causes"]
@@ -121,7 +142,7 @@ def judge(row: dict) -> dict:
         return {"right": False, "effect": False, "note": row["error"]}
     truth, causes = row["truth"], row["causes"]
     named = {(c["effect"], c["joint"]) for c in causes if c["probability"] > 0.5}
-    wanted = {(t["effect"], t["place"]) for t in truth}
+    wanted = {(t["effect"], t["place"]) for t in truth if not t["effect"].startswith("outside:")}
     right = named == wanted
     errors = []
     for t in truth:
@@ -164,24 +185,36 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", choices=SIZES, default="quick")
     parser.add_argument("--effects", default="", help="comma-separated; all where empty; 'six' for the first six")
-    parser.add_argument("--count", type=int, default=1, help="effects hidden at once; 0 for none")
-    parser.add_argument("--robot", default="ur10")
+    parser.add_argument("--kind", choices=(*KINDS, "mix"), default="one", help="what is hidden")
+    parser.add_argument("--robot", default="ur10", help="folder or name of an arm; 'mix' draws one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--cases", type=int, help="number of cases, instead of a size")
+    parser.add_argument("--out", type=Path, help="stem of the results: .json, .txt and .png")
     args = parser.parse_args()
     names = ISSUE_SIX if args.effects == "six" else tuple(filter(None, args.effects.split(","))) or None
-    cases = [(args.seed + i, names, args.count, args.robot) for i in range(SIZES[args.size])]
+    cases = [(args.seed + i, names, args.kind, args.robot) for i in range(args.cases or SIZES[args.size])]
+    os.environ["SIMGAP_THREADS"] = "1"
     with ProcessPoolExecutor(args.workers) as executor:
         rows = run(cases, executor)
-    right = sum(r["judged"]["right"] for r in rows)
-    errors = [e for r in rows for e in r["judged"].get("errors", [])]
-    closed = [r["gain"]["gap_closed"] for r in rows if r.get("gain") and r["gain"]["gap_closed"] is not None]
-    print(f"{right} of {len(rows)} right; median parameter error {np.median(errors) if errors else float('nan'):.3g};"
-          f" median gap closed {np.median(closed) if closed else float('nan'):.3g}")
+    text = table(rows)
+    print(text)
     if args.out:
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        args.out.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        options = f"--kind {args.kind} --robot {args.robot} --seed {args.seed} --cases {len(rows)}"
+        if args.effects:
+            options += f" --effects {args.effects}"
+        head = f"python benchmarks/blind.py {options}, commit {commit()}"
+        lines = "\n".join(line(row) for row in rows)
+        args.out.with_suffix(".txt").write_text(f"{head}\n{lines}\n{text}\n", encoding="utf-8")
+        pictures(rows, args.out.with_suffix(".png"))
+
+
+def commit() -> str:
+    """Short name of the commit that is checked out, with a plus where files differ from it."""
+    found = subprocess.run(["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=False)
+    return found.stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":

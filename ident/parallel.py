@@ -18,9 +18,13 @@ Result = TypeVar("Result")
 def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """``[function(x) for x in items]`` on a thread per core, in order.
 
-    Threads serve because the work is in compiled code that releases the interpreter's lock.
+    Threads serve because the work is in compiled code that releases the interpreter's lock. The
+    environment variable ``SIMGAP_THREADS`` sets another number: 1 where processes share the cores.
     """
-    with ThreadPoolExecutor(max_workers=os.cpu_count() or 1) as pool:
+    threads = int(os.environ.get("SIMGAP_THREADS", "0")) or os.cpu_count() or 1
+    if threads == 1:
+        return [function(x) for x in items]
+    with ThreadPoolExecutor(max_workers=threads) as pool:
         return list(pool.map(function, items))
 
 
