@@ -154,8 +154,7 @@ def attribute(
             break
         best, before = found.candidates[0], found.before
         fall = (before.cost - best.fit.cost) / found.scale
-        share = (before.cost - best.fit.cost) / max(before.cost - before.count, 1.0)
-        if fall < MIN_EVIDENCE or share < MIN_SHARE:
+        if fall < MIN_EVIDENCE or explained(problem, before, best.fit) < MIN_SHARE:
             break
         if best.hypothesis.decoy:
             unknown = True
@@ -166,6 +165,26 @@ def attribute(
         taken = {e.hypothesis.key for e in current.model.effects}
         hypotheses = tuple(h for h in hypotheses if h.key not in taken)
     return Attribution(baseline, detected, p_value, tuple(rounds), current, unknown)
+
+
+def explained(problem: Problem, before: Fit, after: Fit) -> float:
+    """Share of the excess over noise that a cause explains: of all of it, or at the joint where it explains most.
+
+    Of several causes at different joints each explains a part of the whole and most of its own joint.
+    """
+    costs = []
+    for result in (before, after):
+        preds = predictions(problem, result.model, result.remainders)
+        errors = (
+            result.weights.apply(g, residual(group, pred))
+            for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
+        )
+        costs.append(sum(np.sum(np.abs(e) ** 2, axis=(0, 1)) for e in errors))
+    falls = costs[0] - costs[1]
+    joint = int(np.argmax(falls))
+    noise = before.count / problem.structure.n
+    whole = np.sum(falls) / max(np.sum(costs[0]) - before.count, 1.0)
+    return float(max(whole, falls[joint] / max(costs[0][joint] - noise, 1.0)))
 
 
 def revived(problem: Problem, model: Model) -> Model:

@@ -397,7 +397,8 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
     if not sure:
         return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
     names = " and ".join(f"{c.effect.replace('_', ' ')} at {c.joint} ({c.probability:.0%})" for c in sure)
-    closed = "" if gain is None or gain.gap_closed is None else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
+    of_torque = any(c.channel != "q_link" and c.effect != "encoder_quantization" for c in sure)
+    closed = "" if gain is None or gain.gap_closed is None or not of_torque else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
     rest = ", and an unknown cause remains" if unknown else ""
     return f"The simulation misses {names}{closed}{rest}."
 

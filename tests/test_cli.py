@@ -3,9 +3,11 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import ident
 from ident.dataset_io import save_dataset
 
 
@@ -85,3 +87,29 @@ def test_a_robot_that_does_not_match_is_one_line_and_overwrites_nothing(dataset,
     assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1
     assert "shoulder_pan_joint" in run.stderr and "drive" in run.stderr
     assert (out / "verdict.json").read_text() == "earlier"
+
+
+def test_shipped_real_data_are_diagnosed(tmp_path):
+    out = tmp_path / "out"
+    run = simgap("demo", "--real", "twomass", "--out", out, "--json", "--quiet")
+    assert run.returncode == 0, run.stderr
+    verdict = json.loads((out / "verdict.json").read_text())
+    assert json.loads(run.stdout)["sentence"] == verdict["sentence"]
+    assert verdict["discrepancy"]["detected"]
+    assert not [c for c in verdict["causes"] if c["probability"] > 0.5]
+    assert {p.name for p in out.iterdir()} >= {"report.html", "recording.rrd", "model.xml", "model.toml"}
+
+
+def test_shipped_real_data_have_source_and_licence_and_pass_the_check():
+    folders = sorted(p for p in (Path(ident.__file__).parent / "real").iterdir() if p.is_dir())
+    assert [f.name for f in folders] == ["kr300", "twomass"]
+    for folder in folders:
+        assert "Permission is hereby granted" in (folder / "LICENSE").read_text()
+        assert "Origin:" in (folder / "SOURCE.md").read_text()
+        assert simgap("check", folder).returncode == 0
+
+
+def test_real_data_that_are_not_shipped_are_one_clear_error(tmp_path):
+    run = simgap("demo", "--real", "atlantis", "--out", tmp_path / "out")
+    assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1
+    assert "atlantis" in run.stderr and "twomass" in run.stderr
