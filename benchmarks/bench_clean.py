@@ -15,11 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from blind import draw_case
 
 from ident.attribute import DETECTION_EXCESS, DETECTION_LEVEL, discrepancy_p_value
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import UNDETERMINED, identify
+from ident.excitation import make_plan, operating_points
+from robot_assets.robot import load_robot
+from sim import run_experiment
+from sim.experiment import draw_drives
+from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
 
 KINDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
@@ -37,11 +41,26 @@ class Draw:
 
 def run_draw(seed: int) -> Draw:
     """Draw, simulate, write, read, identify."""
-    case = draw_case(seed, None, "none", "ur10")
+    rng = np.random.default_rng(seed)
+    robot = load_robot("ur10")
+    plant, postures = build_plant(robot), operating_points(robot, 2, rng)
+    plan = make_plan(
+        robot,
+        points=2,
+        validation_points=0,
+        levels=(1.0, 0.4),
+        seed=seed,
+        period=2000,
+        postures=postures,
+        trajectory=False,
+        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
+        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
+    )
+    drives = draw_drives(rng, robot)
     with tempfile.TemporaryDirectory() as folder:
-        save_dataset(case.simulate(), Path(folder) / "d")
+        save_dataset(run_experiment(plan, seed=seed, drives=drives), Path(folder) / "d")
         _, result = identify(load_dataset(Path(folder) / "d"))
-    truth = np.concatenate([case.drives[k] for k in KINDS])
+    truth = np.concatenate([drives[k] for k in KINDS])
     error = np.exp(result.model.par.to_log()) / truth - 1.0
     std = np.sqrt(np.diag(result.covariance()))[: len(truth)]
     seen = discrepancy_p_value(result) < DETECTION_LEVEL and result.chi2_per_dof > DETECTION_EXCESS

@@ -19,7 +19,7 @@ from ident.extended import Effect, Model, Prediction
 from ident.graybox import parameter_names
 from ident.hypotheses import Hypothesis, Parameter, catalogue
 from ident.parallel import map_threads
-from ident.screening import Score, screen
+from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import (
     ANNEALING,
     Fit,
@@ -39,8 +39,8 @@ HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
-GEAR_STEPS = 10  # the same of a law of the gear
-ANSWERED = 0.2  # share of the excess that the best may leave where no law of the gear is tried beyond the screened ones
+STRONG_STEPS = 10  # the same of a strong effect
+ANSWERED = 0.2  # share of the excess that the best may leave where no strong effects are tried beyond the screened ones
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 HOPEFUL = 5  # candidates fitted further after the first steps
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
@@ -367,7 +367,7 @@ def explore(
     found = first_steps(chosen, FIRST_STEPS)
     answered = min((r.cost - r.count for _, r in found), default=np.inf) < ANSWERED * excess
     if not answered:
-        found += first_steps(gear_laws(problem, stage, preds, scores), GEAR_STEPS)
+        found += first_steps(strong_effects(problem, stage, preds, scores), STRONG_STEPS)
     found = hopeful(found)
     if not (rough and answered):
         found = map_threads(finished, found)
@@ -415,25 +415,22 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     return out
 
 
-def gear_laws(
+def strong_effects(
     problem: Problem, stage: Fit, preds: Sequence[Prediction], scores: Sequence[Score]
 ) -> list[Score]:
-    """The laws of the gear at the joint that carries most of the discrepancy, each from a size of its own.
+    """Friction and the laws of the gear at the joint that carries most of the discrepancy, of a strong size.
 
-    A gear that stiffens or softens moves its resonance with the amplitude, and its law trades with
-    stiffness along a curved valley: the linear step of a score says little about either.
+    A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
+    of the time hardly shows its inertia: the linear step of a score says little about either.
     """
     excess = np.zeros(problem.structure.n)
     for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
         e = stage.weights.apply(g, residual(group, pred))
         excess += np.sum(np.abs(e) ** 2 - 2.0, axis=(0, 1))
     loudest = int(np.argmax(excess))
-    deflection = np.sqrt(
-        np.mean([np.mean(p.motion(g).delta(loudest) ** 2) for g, p in zip(problem.groups, preds, strict=True)])
-    )
-    stiffness = float(stage.model.par.stiffness[loudest])
+    scale = signal_scale(problem, preds, loudest, ())
     return [
-        replace(s, start=s.hypothesis.options["size"](stiffness, deflection))
+        replace(s, start=s.hypothesis.options["size"](scale))
         for s in scores
         if s.hypothesis.joint == loudest and "size" in s.hypothesis.options
     ]

@@ -39,6 +39,7 @@ UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
 WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it
 LEFT_ERROR = 3.0  # the same above which an unknown cause remains however strong the named ones are
+IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 SEED = 0
 
@@ -250,7 +251,8 @@ def make_verdict(
         or fails_held_out(gain)
     )
     causes = []
-    trust = known_probability(left, result.unknown or fails_held_out(gain)) if result.detected else 1.0
+    refuted = result.unknown or fails_held_out(gain) or collapsed(setup.problem, final)
+    trust = known_probability(left, refuted) if result.detected else 1.0
     covariance = final.covariance()
     rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
     for effect in final.model.effects:
@@ -326,6 +328,17 @@ def explained_share(found: Round, final: Fit) -> float:
 def fails_held_out(gain: Gain | None) -> bool:
     """Whether the extended model predicts held-out data worse than the baseline: no name is trusted then."""
     return gain is not None and gain.after > WORSE * gain.before
+
+
+def collapsed(problem: Problem, final: Fit) -> bool:
+    """Whether the final model explains the data badly and with drives that cannot be those of this arm.
+
+    Stiffness or motor inertia far from the starting guesses then stand for what is missing, and so may
+    the causes that were found beside them.
+    """
+    par, nominal = final.model.par, problem.nominal
+    ratio = np.concatenate([par.stiffness / nominal.stiffness, par.inertia / nominal.inertia])
+    return final.chi2_per_dof > LEFT_ERROR and bool(np.any(np.abs(np.log(ratio)) > np.log(IMPLAUSIBLE)))
 
 
 def known_probability(left: float, refuted: bool) -> float:

@@ -59,6 +59,7 @@ def signal_scale(
         v=float(np.sqrt(np.mean(v))),
         q=float(np.sqrt(np.mean(q))),
         delta=np.quantile(all_delta, [0.1, 0.5, 0.9, 0.995]),
+        delta_rms=float(np.sqrt(np.mean(all_delta**2))),
         torque=float(np.sqrt(np.mean(torque))),
         residual=float(np.sqrt(np.mean(res))),
         stiffness=float(predictions[0].par.stiffness[joint]),

@@ -19,7 +19,7 @@ def torque_constant(joint: int, place: str) -> Hypothesis:
         place,
         joint,
         "drive",
-        (Parameter("scale", "1", 0.05, 20.0, log=True),),
+        (Parameter("scale", "1", 0.2, 5.0, log=True),),
         lambda p, motion, j, k, U: U / p[0],
         lambda scale: [()],
         screen,

@@ -53,6 +53,7 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
         screen,
         "The residual torque of {joint} is a step in its velocity: a friction torque of {torque:.3g} N m"
         " against the motion whatever its speed.",
+        options={"size": lambda s: np.array([0.4 * s.torque, 0.0, 0.05 * s.v])},
     )
 
 

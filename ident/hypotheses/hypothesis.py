@@ -100,7 +100,8 @@ class Hypothesis:
         law: (p, motion, joint, stiffness) -> array as the channel says.
         screen: motion, joint, stiffness, scale -> unit responses.
         sentence: evidence with {joint} and the parameters as fields.
-        options: what single hypotheses need beyond that. ``absorbs`` names an effect that this one
+        options: what single hypotheses need beyond that. ``size(scale)`` gives parameters of a strong effect
+            to start from where no linear step leads there. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
             place of one with parameters ``old`` at the same joint. ``essential`` names the parameter without
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together.
@@ -133,13 +134,14 @@ class SignalScale:
 
     Attributes:
         v: rms velocity, rad/s; q: rms excursion, rad; delta: quantiles of |deflection| at
-        10, 50, 90, 99.5 %; torque: rms dynamic torque, N m; residual: rms residual torque, N m;
+        10, 50, 90, 99.5 %; delta_rms: rad; torque: rms dynamic torque, N m; residual: rms residual torque, N m;
         stiffness: N m/rad; wave_numbers: candidate periodicities in motor angle, 1/rad.
     """
 
     v: float
     q: float
     delta: np.ndarray
+    delta_rms: float
     torque: float
     residual: float
     stiffness: float

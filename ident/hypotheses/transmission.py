@@ -37,7 +37,7 @@ def hardening_stiffness(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} stiffens with its deflection (cubic term {cubic:.3g} N m/rad3): the resonance"
         " climbs with amplitude and with gravity load.",
         variable="delta",
-        options={"size": lambda k, delta: np.array([0.3 * k / delta**2])},
+        options={"size": lambda s: np.array([0.3 * s.stiffness / s.delta_rms**2])},
     )
 
 
@@ -62,7 +62,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} has a dead band of {gap:.3g} rad: its resonance drops at small amplitude wherever"
         " gravity does not preload it.",
         variable="delta",
-        options={"size": lambda k, delta: np.array([0.5 * delta])},
+        options={"size": lambda s: np.array([0.5 * s.delta_rms])},
     )
 
 
@@ -92,7 +92,7 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} is soft about zero torque ({low_stiffness:.3g} N m/rad within"
         " {transition:.3g} rad): its resonance falls where it carries little.",
         variable="delta",
-        options={"size": lambda k, delta: np.array([0.5 * k, 0.5 * delta])},
+        options={"size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms])},
     )
 
 
@@ -120,7 +120,7 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
         "The torque of {joint} makes loops against the gear's deflection: an element of {stiffness:.3g} N m/rad"
         " that yields at {yield_torque:.3g} N m.",
         variable="delta",
-        options={"size": lambda k, delta: np.array([0.4 * k, 0.2 * k * delta])},
+        options={"size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms])},
     )
 
 
