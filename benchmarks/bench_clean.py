@@ -95,7 +95,10 @@ def main() -> None:
     args = parser.parse_args()
     os.environ["SIMGAP_THREADS"] = "1"
     with ProcessPoolExecutor(args.workers) as executor:
-        draws = list(executor.map(run_draw, range(args.seed, args.seed + args.draws)))
+        draws = []
+        for draw in executor.map(run_draw, range(args.seed, args.seed + args.draws)):
+            draws.append(draw)
+            print(f"{len(draws)}/{args.draws}: chi2 per degree of freedom {draw.chi2_per_dof:.3f}", flush=True)
     text = table(draws)
     print(text)
     if args.out:
