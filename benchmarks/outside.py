@@ -26,7 +26,7 @@ class QuadraticDrag:
 
 @dataclass(frozen=True)
 class PostureFriction:
-    """Friction of the motor that changes sign-free with the posture: ``(base + slope q) sign(v)``."""
+    """Friction of the motor that grows with the distance from a posture: ``slope |q - centre| sign(v)``."""
 
     place: str
     slope: float
