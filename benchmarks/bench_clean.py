@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from provenance import commit
 
 from ident.attribute import DETECTION_EXCESS, DETECTION_LEVEL, discrepancy_p_value
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import UNDETERMINED, identify
-from ident.excitation import make_plan, operating_points
+from ident.excitation import operating_points
 from robot_assets.robot import load_robot
 from sim import run_experiment
-from sim.experiment import draw_drives
-from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+from sim.experiment import draw_drives, plan_experiment
 
 KINDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
@@ -43,18 +43,15 @@ def run_draw(seed: int) -> Draw:
     """Draw, simulate, write, read, identify."""
     rng = np.random.default_rng(seed)
     robot = load_robot("ur10")
-    plant, postures = build_plant(robot), operating_points(robot, 2, rng)
-    plan = make_plan(
+    plan = plan_experiment(
         robot,
+        operating_points(robot, 2, rng),
         points=2,
         validation_points=0,
         levels=(1.0, 0.4),
         seed=seed,
         period=2000,
-        postures=postures,
         trajectory=False,
-        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
-        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
     )
     drives = draw_drives(rng, robot)
     with tempfile.TemporaryDirectory() as folder:
@@ -102,7 +99,8 @@ def main() -> None:
     text = table(draws)
     print(text)
     if args.out:
-        args.out.write_text(text + "\n", encoding="utf-8")
+        head = f"python benchmarks/bench_clean.py --draws {args.draws} --seed {args.seed}, commit {commit()}"
+        args.out.write_text(f"{head}\n{text}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

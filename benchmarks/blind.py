@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import tempfile
 import time
 import traceback
@@ -24,16 +23,17 @@ from pathlib import Path
 import numpy as np
 from blind_summary import pictures, table
 from outside import draw_outside
+from provenance import commit
 
 from ident.dataset import Dataset
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
-from ident.excitation import Plan, make_plan, operating_points
+from ident.excitation import Plan, operating_points
 from robot_assets.robot import load_robot
 from sim import draw_effect, run_experiment
 from sim.effects import EFFECTS, parameters_of
-from sim.experiment import draw_drives
-from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+from sim.experiment import draw_drives, plan_experiment
+from sim.plant import build_plant, gravity_torque
 
 ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "hardening_stiffness", "payload")
 ARMS = ("ur10", "irb", "panda")
@@ -75,14 +75,12 @@ def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: s
     pool = names or tuple(EFFECTS)
     plant = build_plant(robot)
     postures = operating_points(robot, 3, rng)
-    plan = make_plan(
+    plan = plan_experiment(
         robot,
+        postures,
         points=2,
         seed=seed,
         levels=(1.0, 0.6, 0.3) if rng.random() < 0.5 else (1.0, 0.4),
-        postures=postures,
-        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
-        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
         period=int(rng.choice([3000, 4000])),
     )
     peak = np.max([np.abs(e.r).max(axis=0) for e in plan.experiments], axis=0)
@@ -209,12 +207,6 @@ def main() -> None:
         lines = "\n".join(line(row) for row in rows)
         args.out.with_suffix(".txt").write_text(f"{head}\n{lines}\n{text}\n", encoding="utf-8")
         pictures(rows, args.out.with_suffix(".png"))
-
-
-def commit() -> str:
-    """Short name of the commit that is checked out, with a plus where files differ from it."""
-    found = subprocess.run(["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":

@@ -26,9 +26,9 @@ from ident.torque_fit import (
     Problem,
     Weights,
     fit,
+    joint_costs,
     make_weights,
     predictions,
-    residual,
     weighted_cost,
 )
 
@@ -172,14 +172,10 @@ def explained(problem: Problem, before: Fit, after: Fit) -> float:
 
     Of several causes at different joints each explains a part of the whole and most of its own joint.
     """
-    costs = []
-    for result in (before, after):
-        preds = predictions(problem, result.model, result.remainders)
-        errors = (
-            result.weights.apply(g, residual(group, pred))
-            for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
-        )
-        costs.append(sum(np.sum(np.abs(e) ** 2, axis=(0, 1)) for e in errors))
+    costs = [
+        joint_costs(problem, predictions(problem, result.model, result.remainders), result.weights)
+        for result in (before, after)
+    ]
     falls = costs[0] - costs[1]
     joint = int(np.argmax(falls))
     noise = before.count / problem.structure.n
@@ -423,11 +419,7 @@ def strong_effects(
     A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
     of the time hardly shows its inertia: the linear step of a score says little about either.
     """
-    excess = np.zeros(problem.structure.n)
-    for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
-        e = stage.weights.apply(g, residual(group, pred))
-        excess += np.sum(np.abs(e) ** 2 - 2.0, axis=(0, 1))
-    loudest = int(np.argmax(excess))
+    loudest = int(np.argmax(joint_costs(problem, preds, stage.weights)))
     scale = signal_scale(problem, preds, loudest, ())
     return [
         replace(s, start=s.hypothesis.options["size"](scale))

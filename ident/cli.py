@@ -79,21 +79,11 @@ def _robot(name: str):
 def _plan(robot, points: int, realizations: int, seed: int, levels: tuple[float, ...]):
     import numpy as np
 
-    from ident.excitation import make_plan, operating_points
-    from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+    from ident.excitation import operating_points
+    from sim.experiment import plan_experiment
 
-    plant = build_plant(robot)
     postures = operating_points(robot, points + 1, np.random.default_rng(seed))
-    return make_plan(
-        robot,
-        points=points,
-        realizations=realizations,
-        levels=levels,
-        seed=seed,
-        postures=postures,
-        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
-        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
-    )
+    return plan_experiment(robot, postures, points=points, realizations=realizations, levels=levels, seed=seed)
 
 
 @app.command()

@@ -243,16 +243,15 @@ def make_verdict(
     """Put the result into the words and numbers of verdict.json."""
     final = result.final
     left = result.left_share if result.detected else 0.0
+    refuted = result.unknown or fails_held_out(gain)
     unknown = result.detected and (
-        result.unknown
+        refuted
         or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)
         or final.chi2_per_dof > LEFT_ERROR
         or not final.model.effects
-        or fails_held_out(gain)
     )
     causes = []
-    refuted = result.unknown or fails_held_out(gain) or collapsed(setup.problem, final)
-    trust = known_probability(left, refuted) if result.detected else 1.0
+    trust = known_probability(left, refuted or collapsed(setup.problem, final)) if result.detected else 1.0
     covariance = final.covariance()
     rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
     for effect in final.model.effects:

@@ -227,10 +227,11 @@ def _inner_torques(
         grid, modes = _modes(structure, par, plane, group, c)
         if effect.hypothesis.channel == "link":
             free = solution.Q_a[..., c] + compliance * (old_link[..., c] - at_link.get(j, 0.0))
-            at_link[j] = at_link.get(j, 0.0) + _link_loop(effect, grid, free, modes)
+            at_link[j] = at_link.get(j, 0.0) + _loop(effect.hypothesis.options["loop"](effect.p), grid, free, modes)
         else:
             free = solution.delta[..., j] + compliance * (old_gear[..., j] - at_gear.get(j, 0.0))
-            at_gear[j] = at_gear.get(j, 0.0) + _spring_loop(effect, grid, free, modes, par.stiffness[j])
+            law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
+            at_gear[j] = at_gear.get(j, 0.0) + _loop(law, grid, free, modes)
     for j, value in at_gear.items():
         old_gear[..., j] = value
     for j, value in at_link.items():
@@ -256,20 +257,13 @@ def _modes(
     return grid, kernels.modal_compliance(plane.lin.M, D, K, int(column), group.period_time / grid.n_time)
 
 
-def _spring_loop(
-    effect: Effect, grid: Group, free: np.ndarray, modes: tuple[np.ndarray, ...], stiffness: float
+def _loop(
+    law: tuple[int, float, float, float], grid: Group, free: np.ndarray, modes: tuple[np.ndarray, ...]
 ) -> np.ndarray:
-    """Spectrum (S, L) of the torque of a gear's law, in steady state with the arm."""
-    code, a, b, k = effect.hypothesis.law(effect.p, None, stiffness)
-    torque = kernels.spring_loop(code, a, b, k, grid.to_time(free[..., None])[..., 0], *modes[1:])
-    return grid.to_lines(torque[..., None])[..., 0]
-
-
-def _link_loop(effect: Effect, grid: Group, free: np.ndarray, modes: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Spectrum (S, L) of a torque with friction on a link, in steady state with the arm."""
-    q, v = (grid.to_time(x[..., None])[..., 0] for x in (free, 1j * grid.omega * free))
-    torque = kernels.link_loop(*effect.hypothesis.options["loop"](effect.p), q, v, *modes)
-    return grid.to_lines(torque[..., None])[..., 0]
+    """Spectrum (S, L) of the torque of a law in steady state with the arm, from where it would be without."""
+    x = grid.to_time(free[..., None])[..., 0]
+    rate = grid.to_time((1j * grid.omega * free)[..., None])[..., 0] if law[0] == kernels.LINK else x
+    return grid.to_lines(kernels.steady_loop(*law, x, rate, *modes)[..., None])[..., 0]
 
 
 def _link_view(motion: Motion, joint: int, column: int) -> Motion:

@@ -15,7 +15,7 @@ import numpy as np
 from ident.extended import Prediction
 from ident.hypotheses.friction import direction
 from ident.records import Group, mean_over_lines
-from ident.torque_fit import Problem
+from ident.torque_fit import Problem, as_real
 
 SURE = 5.0  # standard deviations from which a delay is one
 LEAST = 0.1  # delay in samples that is worth a name
@@ -87,8 +87,7 @@ def _fit_delay(pairs: Sequence[tuple[Group, Prediction]], j: int) -> tuple[float
 
 def _stack(rows: np.ndarray, weight: np.ndarray | float) -> np.ndarray:
     """Complex (S, K, 4) as weighted real rows (2 S K, 4)."""
-    flat = (rows * np.reshape(np.sqrt(weight), (-1, 1))).reshape(-1, rows.shape[-1])
-    return np.concatenate([flat.real, flat.imag])
+    return as_real(rows * np.reshape(np.sqrt(weight), (-1, 1)))
 
 
 def _inverse_noise(rows: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -100,11 +100,11 @@ class Group:
 
     def to_time(self, X: np.ndarray) -> np.ndarray:
         """Spectrum (..., L, m) on the time grid (..., n_time, m)."""
-        return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward", workers=1)
+        return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward")
 
     def to_lines(self, x: np.ndarray) -> np.ndarray:
         """Time grid (..., n_time, m) to spectrum (..., L, m)."""
-        full = scipy.fft.rfft(x, axis=-2, norm="forward", workers=1)
+        full = scipy.fft.rfft(x, axis=-2, norm="forward")
         return full[..., : len(self.omega), :]
 
     def observe(self, X: np.ndarray) -> np.ndarray:
@@ -207,7 +207,7 @@ def _middle_periods(members: list[Segment]) -> np.ndarray:
 
 def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:
     """(P, N, n) time samples to (P, n_lines, n) spectra."""
-    return scipy.fft.rfft(x, axis=1, norm="forward", workers=1)[:, :n_lines]
+    return scipy.fft.rfft(x, axis=1, norm="forward")[:, :n_lines]
 
 
 def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:

@@ -12,7 +12,7 @@ from ident.dataset import Dataset, Segment
 from ident.extended import Model, Prediction, predict
 from ident.frf import estimate_frf
 from ident.records import Group
-from ident.torque_fit import Fit, Problem, noise_covariance, residual
+from ident.torque_fit import Fit, Problem, joint_costs, noise_covariance, residual
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
 from robot_assets.errors import DataError
 
@@ -190,13 +190,11 @@ def evidence_plot(problem: Problem, fit: Fit, predictions: Sequence[Prediction],
 
 def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> str:
     """Where an unexplained residual sits: joint, band, growth with level, best variable."""
-    n = problem.structure.n
-    power, band = np.zeros(n), None
+    power = joint_costs(problem, predictions, fit.weights)
     levels: dict[float, list[float]] = {}
     spectra = []
-    for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
+    for group, pred in zip(problem.groups, predictions, strict=True):
         e = np.abs(residual(group, pred)) ** 2
-        power += np.sum(np.abs(fit.weights.apply(g, residual(group, pred))) ** 2, axis=(0, 1))
         spectra.append((group.omega[: group.n_compared] / 2 / np.pi, e.sum(axis=0)))
         for s, level in enumerate(group.amplitude):
             levels.setdefault(float(level), []).append(float(e[s].sum()))

@@ -399,12 +399,16 @@ def predictions(
 
 def weighted_cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
     """Whitened sum of squares of the torque residual."""
-    return float(
-        sum(
-            np.sum(np.abs(weights.apply(g, residual(group, pred))) ** 2)
-            for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
-        )
+    return float(np.sum(joint_costs(problem, preds, weights)))
+
+
+def joint_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """The same by joint; (n,)."""
+    errors = (
+        weights.apply(g, residual(group, pred))
+        for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
     )
+    return np.sum([np.sum(np.abs(e) ** 2, axis=(0, 1)) for e in errors], axis=0)
 
 
 def _normal(

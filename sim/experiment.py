@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.excitation import LOOP_HZ, Experiment, Plan
+from ident.excitation import LOOP_HZ, Experiment, Plan, make_plan
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 from sim.loop import Controller, Noise, failed, run_loop
@@ -24,6 +25,23 @@ def draw_drives(rng: np.random.Generator, robot: Robot, factor: float = 2.0) -> 
         f: robot.array(f) * np.exp(rng.uniform(-np.log(factor), np.log(factor), robot.n))
         for f in DRIVE_FIELDS
     }
+
+
+def plan_experiment(robot: Robot, postures: np.ndarray, **options: Any) -> Plan:
+    """A plan whose levels suit the inertia and the gravity torque that the arm has in all its postures.
+
+    Args:
+        postures: (points, n) rad, those for validation last.
+        options: others of ``ident.excitation.make_plan``.
+    """
+    plant = build_plant(robot)
+    return make_plan(
+        robot,
+        postures=postures,
+        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
+        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
+        **options,
+    )
 
 
 def run_experiment(

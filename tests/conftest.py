@@ -6,28 +6,24 @@ import numpy as np
 import pytest
 
 from ident.dataset_io import load_dataset, save_dataset
-from ident.excitation import make_plan, operating_points
+from ident.excitation import operating_points
 from robot_assets.robot import load_robot
 from sim import run_experiment
-from sim.experiment import draw_drives
-from sim.plant import build_plant, gravity_torque, link_inertia_diagonal
+from sim.experiment import draw_drives, plan_experiment
 
 
 def small_plan(robot, seed, *, points=2, levels=(1.0, 0.4), period=2000, validation_points=1, trajectory=False, **kwargs):
     """A plan of 2 s periods, scaled to the arm."""
-    plant = build_plant(robot)
     postures = operating_points(robot, points + validation_points, np.random.default_rng(seed))
-    return make_plan(
+    return plan_experiment(
         robot,
+        postures,
         points=points,
         validation_points=validation_points,
         levels=levels,
         seed=seed,
         period=period,
-        postures=postures,
         trajectory=trajectory,
-        inertia=np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0),
-        gravity_torque=np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0),
         **kwargs,
     )
 

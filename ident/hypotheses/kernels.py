@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 SWEEPS = 25  # periods at most until the steady state
-CUBIC, BACKLASH, SOFTENING, HYSTERESIS = 0, 1, 2, 3
+CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK = 0, 1, 2, 3, 4
 
 
 @njit(cache=True, nogil=True)
@@ -139,116 +139,70 @@ def periodic_start(start: np.ndarray, end: np.ndarray, decay: np.ndarray, T: int
 
 
 @njit(cache=True, nogil=True)
-def link_loop(
-    stiffness: float,
-    friction: float,
-    turn: float,
-    q: np.ndarray,
-    v: np.ndarray,
-    poles: np.ndarray,
-    decay: np.ndarray,
-    gain_old: np.ndarray,
-    gain_new: np.ndarray,
-) -> np.ndarray:
-    """Steady state of ``h = stiffness q + friction tanh(v / turn)`` on a link; (S, T) torque.
-
-    ``h`` moves the link back through the compliance of ``modal_compliance``, whose velocity is that
-    of its modes (residues add up to zero: a torque does not step a velocity).
-
-    Args:
-        q, v: (S, T) link position and velocity without ``h``, rad, rad/s.
-        poles, decay, gain_old, gain_new: (modes,) complex.
-    """
-    S, T = q.shape
-    modes = len(poles)
-    out = np.zeros((S, T))
-    dq = 0.0
-    dv = 0.0
-    for m in range(modes):
-        dq += gain_new[m].real
-        dv += (poles[m] * gain_new[m]).real
-    x = np.zeros(modes, np.complex128)
-    start = np.zeros(modes, np.complex128)
-    for i in range(S):
-        x[:] = 0.0
-        start[:] = 0.0
-        h = stiffness * q[i, T - 1] + friction * np.tanh(v[i, T - 1] / turn)
-        for sweep in range(SWEEPS):
-            change = 0.0
-            largest = 0.0
-            for t in range(T):
-                free_q = q[i, t]
-                free_v = v[i, t]
-                for m in range(modes):
-                    x[m] = decay[m] * x[m] + gain_old[m] * h
-                    free_q -= x[m].real
-                    free_v -= (poles[m] * x[m]).real
-                h = link_point(stiffness, friction, turn, free_q, free_v, dq, dv, h)
-                for m in range(modes):
-                    x[m] += gain_new[m] * h
-                change = max(change, abs(h - out[i, t]))
-                largest = max(largest, abs(h))
-                out[i, t] = h
-            if sweep > 0 and change <= 1e-5 * largest:
-                break
-            periodic_start(start, x, decay, T)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def spring_loop(
+def steady_loop(
     code: int,
     a: float,
     b: float,
     k: float,
     linear: np.ndarray,
+    rate: np.ndarray,
+    poles: np.ndarray,
     decay: np.ndarray,
     gain_old: np.ndarray,
     gain_new: np.ndarray,
 ) -> np.ndarray:
-    """Steady state of ``delta = linear - r * h(delta)``; (S, T) torque ``h``.
+    """Steady state of a law that moves the arm by which it is moved; (S, T) torque ``h``.
 
-    ``r`` is the compliance of the arm at the spring, as a sum of modes stepped with a first-order
-    hold: ``x+ = decay x + gain_old h + gain_new h+``, ``delta = linear - Re sum x``.
+    ``x = linear - r * h(x, x')`` with ``r`` the compliance of the arm at the law, as a sum of modes stepped
+    with a first-order hold: ``x+ = decay x + gain_old h + gain_new h+``. The velocity is that of the modes
+    (residues add up to zero: a torque does not step a velocity).
 
     Args:
-        code, a, b: law and its two parameters; k: linear stiffness, N m/rad.
-        linear: (S, T) deflection without ``h``, rad.
-        decay, gain_old, gain_new: (modes,) complex.
+        code, a, b, k: law. Of a gear, its two parameters and the linear stiffness, N m/rad; ``LINK``:
+            ``a x + b tanh(x' / k)`` on a link.
+        linear, rate: (S, T) position and velocity without ``h``, rad, rad/s; the latter for ``LINK`` alone.
+        poles, decay, gain_old, gain_new: (modes,) complex.
     """
     S, T = linear.shape
     modes = len(decay)
     out = np.zeros((S, T))
     direct = 0.0
+    direct_rate = 0.0
     for m in range(modes):
         direct += gain_new[m].real
-    x = np.zeros(modes, np.complex128)
+        direct_rate += (poles[m] * gain_new[m]).real
+    state = np.zeros(modes, np.complex128)
     start = np.zeros(modes, np.complex128)
     for i in range(S):
-        x[:] = 0.0
+        state[:] = 0.0
         start[:] = 0.0
-        h = spring_torque(code, a, b, k, linear[i, T - 1], linear[i, T - 1], 0.0)
-        delta = linear[i, T - 1]
+        x = linear[i, T - 1]
+        h = a * x + b * np.tanh(rate[i, T - 1] / k) if code == 4 else spring_torque(code, a, b, k, x, x, 0.0)
         for sweep in range(SWEEPS):
             change = 0.0
             largest = 0.0
             for t in range(T):
                 free = linear[i, t]
                 for m in range(modes):
-                    x[m] = decay[m] * x[m] + gain_old[m] * h
-                    free -= x[m].real
-                guess = spring_point(code, a, b, k, free, direct, delta, h)
-                h_new = spring_torque(code, a, b, k, guess, delta, h)
+                    state[m] = decay[m] * state[m] + gain_old[m] * h
+                    free -= state[m].real
+                if code == 4:
+                    free_rate = rate[i, t]
+                    for m in range(modes):
+                        free_rate -= (poles[m] * state[m]).real
+                    h = link_point(a, b, k, free, free_rate, direct, direct_rate, h)
+                else:
+                    new = spring_point(code, a, b, k, free, direct, x, h)
+                    h = spring_torque(code, a, b, k, new, x, h)
+                    x = new
                 for m in range(modes):
-                    x[m] += gain_new[m] * h_new
-                delta = guess
-                h = h_new
+                    state[m] += gain_new[m] * h
                 change = max(change, abs(h - out[i, t]))
                 largest = max(largest, abs(h))
                 out[i, t] = h
             if sweep > 0 and change <= 1e-5 * largest:
                 break
-            periodic_start(start, x, decay, T)
+            periodic_start(start, state, decay, T)
     return out
 
 

@@ -20,6 +20,7 @@ from ident.graybox import (
     impedance,
     linearise,
 )
+from ident.hypotheses import kernels
 from ident.hypotheses.friction import SMOOTHING, direction
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.inverse import (
@@ -136,7 +137,7 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
         screen,
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
-        options={"loop": lambda p: (p[0], p[1], p[2])},
+        options={"loop": lambda p: (kernels.LINK, p[0], p[1], p[2])},
     )
 
 

@@ -1,0 +1,100 @@
+"""How candidates are weighed and scored: closed forms of the evidence, and one sum by two ways."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ident.attribute import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, weigh
+from ident.hypotheses import catalogue
+from ident.hypotheses.hypothesis import LOG_SPREAD
+from ident.reporting import frf_views
+from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
+from ident.torque_fit import joint_costs, predictions, weighted_cost
+
+
+def candidate(h, p, information, cost=1000.0):
+    """A refitted hypothesis whose other coordinates do not matter."""
+    H = np.zeros((3 + len(p), 3 + len(p)))
+    H[:3, :3] = np.eye(3)
+    H[3:, 3:] = np.diag(information)
+    par = SimpleNamespace(stiffness=np.full(6, 1e4))
+    model = SimpleNamespace(effects=(SimpleNamespace(hypothesis=h, p=np.array(p, float)),), par=par)
+    return Candidate(h, SimpleNamespace(model=model, information=H, cost=cost), 0.0)
+
+
+@pytest.fixture(scope="module")
+def identified(clean):
+    from ident.diagnose import identify
+
+    return clean[0], *identify(clean[0])
+
+
+@pytest.fixture(scope="module")
+def named(identified):
+    return {h.key: h for h in catalogue(identified[1].problem.structure)}
+
+
+def test_a_parameter_costs_what_the_data_narrow_it_down_by(named):
+    delay = named["torque_delay", "elbow_joint"]
+    for information in (1e2, 1e6):
+        expected = -0.5 * np.log(1.0 + LOG_SPREAD**2 * information / TEMPER)
+        assert occam(candidate(delay, [1e-3], [information]), TEMPER) == pytest.approx(expected, rel=1e-6)
+    assert occam(candidate(delay, [1e-3], [0.0]), TEMPER) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_an_absent_parameter_costs_nothing_unless_it_makes_the_effect(named):
+    coulomb, drift = named["coulomb_friction", "elbow_joint"], named["friction_drift", "elbow_joint"]
+    information = 1e4
+    near = 0.5 * ABSENT * np.sqrt(TEMPER / information)
+    none, some = (occam(candidate(coulomb, [3.0, a, 1e-3], [1e4, information, 1.0]), TEMPER) for a in (near, 0.5))
+    assert none > some + 3.0
+    free = [information, 0.0, 1e4, 0.0, 0.0]
+    absent, present = (occam(candidate(drift, [c, 60.0, 3.0, 1e-3, 1e-3], free), TEMPER) for c in (near, 0.5))
+    without = -0.5 * np.log(1.0 + LOG_SPREAD**2 * 1e4 / TEMPER)
+    assert absent == pytest.approx(without - POINTLESS_NATS - 0.5 * (near / 0.5) ** 2, abs=1e-3)
+    assert present > absent - POINTLESS_NATS
+
+
+def test_a_law_and_its_limit_tie_where_the_data_cannot_tell_them_apart(named):
+    gap, soft = named["backlash", "elbow_joint"], named["softening_stiffness", "elbow_joint"]
+    one, two = candidate(gap, [5e-4], [1e5]), candidate(soft, [3e3, 3e-4], [0.0, 1e5])
+    assert [c.probability for c in weigh([one, two], 900)] == pytest.approx([0.5, 0.5], abs=0.01)
+    better = candidate(soft, [3e3, 3e-4], [0.0, 1e5], cost=900.0)
+    assert weigh([one, better], 900)[0].hypothesis is soft
+
+
+def test_costs_by_joint_add_up_and_a_better_fit_explains_more(identified):
+    _, setup, result = identified
+    preds = predictions(setup.problem, result.model, result.remainders)
+    costs = joint_costs(setup.problem, preds, result.weights)
+    assert costs.shape == (6,) and costs.sum() == pytest.approx(result.cost, rel=1e-6)
+    assert weighted_cost(setup.problem, preds, result.weights) == pytest.approx(result.cost, rel=1e-6)
+    assert explained(setup.problem, result, result) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("channel", ["motor", "spring", "link", "position", "drive"])
+def test_signals_summed_line_by_line_are_those_of_whole_torques(identified, channel):
+    _, setup, result = identified
+    stage = _Stage.build(setup.problem, result, predictions(setup.problem, result.model, result.remainders))
+    group, pred = setup.problem.groups[0], stage.predictions[0]
+    rng = np.random.default_rng(0)
+    shape = (*group.U.shape[:2], 2)
+    X, M = (rng.normal(size=shape) + 1j * rng.normal(size=shape) for _ in range(2))
+    parts = [(channel, X), ("motor", M)]
+    quick = _line_sums([(_Field.build(stage, 0, c, 3), x[:, : group.n_compared]) for c, x in parts])
+    whole = _whole_sums(stage, 0, sum(_gain(pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts))
+    for name in ("own", "residual", "columns"):
+        a, b = getattr(quick, name), getattr(whole, name)
+        assert np.abs(a - b).max() < 1e-10 * np.abs(b).max()
+
+
+def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):
+    data, setup, result = identified
+    preds = predictions(setup.problem, result.model, result.remainders)
+    views = frf_views(data, setup.problem, preds, preds)
+    assert len(views) == 2
+    for view in views:
+        off = np.abs(view.extended - view.measured) / view.measured_std
+        assert np.median(off) < 2.0 and np.array_equal(view.baseline, view.extended)
+        assert np.all(np.abs(view.extended - view.measured) < 0.2 * np.abs(view.measured).max())
