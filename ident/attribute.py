@@ -25,6 +25,7 @@ from ident.torque_fit import (
     Fit,
     Problem,
     Weights,
+    anneal,
     fit,
     joint_costs,
     make_weights,
@@ -108,23 +109,23 @@ def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None
     """
     names = parameter_names(problem.structure.robot)
     start = Model(problem.structure, problem.nominal)
-    best = fit(problem, start, base_names=names, annealing=ANNEALING, progress=progress)
+    best = first = anneal(problem, start, base_names=names, progress=progress)
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
             damping = np.maximum(par.damping, problem.nominal.damping) * factor
             again = Model(problem.structure, replace(par, damping=damping))
-            other = fit(
+            other = anneal(
                 problem,
                 again,
                 base_names=names,
-                annealing=ANNEALING[-2:],
+                ladder=ANNEALING[-2:],
                 iterations=8,
                 remainders=best.remainders,
                 progress=progress,
             )
             best = min(best, other, key=lambda f: f.cost)
-    return best
+    return replace(best, softer=first.softer)
 
 
 def discrepancy_p_value(result: Fit) -> float:
@@ -219,14 +220,15 @@ def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
     hypothesis leads back. With an error relative to the torque added to the noise the baseline
     stays near, and hypotheses can be compared.
     """
-    names = parameter_names(problem.structure.robot)
-    model, best, level = replace(current.model, par=problem.nominal), None, 0.0
-    for rho in ANNEALING[:-1]:
-        found = fit(problem, model, base_names=names, annealing=(rho,))
-        if best is not None and found.chi2_per_dof > STRONG:
-            break
-        model, best, level = found.model, found, rho
-    return best, level
+    stages, ladder = current.softer, ANNEALING[:-1]
+    if not stages:
+        start = replace(current.model, par=problem.nominal)
+        last = anneal(problem, start, base_names=parameter_names(problem.structure.robot), ladder=ladder)
+        stages = (*last.softer, last)
+    kept = 1
+    while kept < len(stages) and stages[kept].chi2_per_dof <= STRONG:
+        kept += 1
+    return stages[kept - 1], ladder[kept - 1]
 
 
 def attribute_once(

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.fft
 
+from ident.columns import Products
 from ident.graybox import (
     Linearisation,
     Parameters,
@@ -326,32 +327,35 @@ def _solution(
     return Solution(Q, Q_a, delta, tau_s, plane.record[:, None] * U, W, torques)
 
 
-def baseline_jacobian(
+def baseline_products(
     structure: Structure, par: Parameters, plane: Plane, solution: Solution, top: int
-) -> np.ndarray:
-    """Derivative of the predicted torque by the log-parameters and, last, the timing.
+) -> Products:
+    """Derivative of the predicted torque by the log-parameters, at lines 0..top-1.
 
-    Torques of effects and the geometric remainder are held. Lines 0..top-1: (S, top, n, n_theta).
+    Torques of effects and the geometric remainder are held. Columns in the order of the parameters.
     """
-    n, n_e = structure.n, len(structure.elastic)
+    n, elastic = structure.n, np.asarray(structure.elastic, int)
     s = plane.s[:top, None]
-    delta, Q, Q_a = solution.delta[:, :top], solution.Q[:, :top], solution.Q_a[:, :top]
-    out = np.zeros((len(Q), top, n, 4 * n + 2 * n_e + 1), complex)
     rec = plane.record[:top, None, None]
-    spring = rec * plane.spring_gain[:top]
-    out[..., :n] = spring * (par.stiffness * delta)[:, :, None, :]
-    out[..., n : 2 * n] = spring * (par.damping * s * delta)[:, :, None, :]
-    k = np.arange(n)
-    motor = plane.record[:top, None] * s * Q
-    out[..., k, 2 * n + k] = motor * s * par.inertia
-    out[..., k, 3 * n + k] = motor * par.viscous
-    if n_e:
-        hinge = rec * plane.link_gain[:top, :, structure.elastic]
-        q_e = Q_a[..., structure.elastic]
-        out[..., 4 * n : 4 * n + n_e] = hinge * (par.elastic_stiffness * q_e)[:, :, None, :]
-        out[..., 4 * n + n_e : -1] = hinge * (par.elastic_damping * s * q_e)[:, :, None, :]
-    out[..., -1] = s * solution.U[:, :top]
-    return out
+    springs = rec * plane.spring_gain[:top]
+    motors = rec * np.eye(n)
+    hinges = rec * plane.link_gain[:top, :, elastic]
+    gains = np.concatenate(
+        [
+            springs * par.stiffness,
+            springs * (par.damping * s)[:, None],
+            motors * (par.inertia * s**2)[:, None],
+            motors * (par.viscous * s)[:, None],
+            hinges * par.elastic_stiffness,
+            hinges * (par.elastic_damping * s)[:, None],
+        ],
+        axis=-1,
+    )
+    signals = np.concatenate(
+        [solution.delta[:, :top], solution.Q[:, :top], solution.Q_a[:, :top, elastic]], axis=-1
+    )
+    k, e = np.arange(n), 2 * n + np.arange(len(elastic))
+    return Products(gains, signals, np.concatenate([k, k, n + k, n + k, e, e]))
 
 
 def coarse_group(group: Group) -> Group:

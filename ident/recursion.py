@@ -60,8 +60,8 @@ def newton_euler(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> n
 
     Source: Luh, Walker and Paul, J. Dyn. Syst. Meas. Control 102 (1980), in frames of the joints.
     """
-    columns = [np.ascontiguousarray(x.T) for x in (q, np.sin(q), np.cos(q), v, a)]
-    out = _recursion(
+    q, v, a = (np.ascontiguousarray(x) for x in (q, v, a))
+    return _recursion(
         chain.parent,
         chain.prismatic,
         chain.axis,
@@ -71,9 +71,12 @@ def newton_euler(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> n
         chain.lever,
         chain.inertia,
         chain.gravity,
-        *columns,
+        q,
+        np.sin(q),
+        np.cos(q),
+        v,
+        a,
     )
-    return np.ascontiguousarray(out.T)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -123,8 +126,8 @@ def _turned(x, axis, sine, cosine):
 
 @njit(cache=True, nogil=True)
 def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, gravity, q, sine, cosine, v, a):
-    N, T = q.shape
-    out = np.empty((N, T))
+    T, N = q.shape
+    out = np.empty((T, N))
     w = np.empty((N, 3, BLOCK))
     dw = np.empty((N, 3, BLOCK))
     acc = np.empty((N, 3, BLOCK))
@@ -147,19 +150,19 @@ def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, 
                     acc_p = (acc[p, 0, b], acc[p, 1, b], acc[p, 2, b])
                 at = (origin[i, 0], origin[i, 1], origin[i, 2])
                 if slides:
-                    at = _add(at, _scaled(_times(rotation[i], e), q[i, t]))
+                    at = _add(at, _scaled(_times(rotation[i], e), q[t, i]))
                 there = _add(_add(acc_p, _cross(dw_p, at)), _cross(w_p, _cross(w_p, at)))
                 w_i = _times_transposed(rotation[i], w_p)
                 dw_i = _times_transposed(rotation[i], dw_p)
                 acc_i = _times_transposed(rotation[i], there)
                 if slides:
-                    acc_i = _add(acc_i, _add(_scaled(_cross(w_i, e), 2.0 * v[i, t]), _scaled(e, a[i, t])))
+                    acc_i = _add(acc_i, _add(_scaled(_cross(w_i, e), 2.0 * v[t, i]), _scaled(e, a[t, i])))
                 else:
-                    w_i = _turned(w_i, e, -sine[i, t], cosine[i, t])
-                    dw_i = _turned(dw_i, e, -sine[i, t], cosine[i, t])
-                    acc_i = _turned(acc_i, e, -sine[i, t], cosine[i, t])
-                    dw_i = _add(dw_i, _add(_scaled(_cross(w_i, e), v[i, t]), _scaled(e, a[i, t])))
-                    w_i = _add(w_i, _scaled(e, v[i, t]))
+                    w_i = _turned(w_i, e, -sine[t, i], cosine[t, i])
+                    dw_i = _turned(dw_i, e, -sine[t, i], cosine[t, i])
+                    acc_i = _turned(acc_i, e, -sine[t, i], cosine[t, i])
+                    dw_i = _add(dw_i, _add(_scaled(_cross(w_i, e), v[t, i]), _scaled(e, a[t, i])))
+                    w_i = _add(w_i, _scaled(e, v[t, i]))
                 f = _scaled(_add(_add(acc_i, _cross(dw_i, c)), _cross(w_i, _cross(w_i, c))), mass[i])
                 m = _add(_times(inertia[i], dw_i), _cross(w_i, _times(inertia[i], w_i)))
                 m = _add(m, _cross(c, f))
@@ -176,15 +179,15 @@ def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, 
                 t = begin + b
                 f = (force[i, 0, b], force[i, 1, b], force[i, 2, b])
                 m = (moment[i, 0, b], moment[i, 1, b], moment[i, 2, b])
-                out[i, t] = _dot(e, f) if slides else _dot(e, m)
+                out[t, i] = _dot(e, f) if slides else _dot(e, m)
                 if p < 0:
                     continue
                 at = (origin[i, 0], origin[i, 1], origin[i, 2])
                 if slides:
-                    at = _add(at, _scaled(_times(rotation[i], e), q[i, t]))
+                    at = _add(at, _scaled(_times(rotation[i], e), q[t, i]))
                 else:
-                    f = _turned(f, e, sine[i, t], cosine[i, t])
-                    m = _turned(m, e, sine[i, t], cosine[i, t])
+                    f = _turned(f, e, sine[t, i], cosine[t, i])
+                    m = _turned(m, e, sine[t, i], cosine[t, i])
                 f = _times(rotation[i], f)
                 m = _add(_times(rotation[i], m), _cross(at, f))
                 for k in range(3):

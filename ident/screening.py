@@ -106,7 +106,7 @@ class _Stage:
     def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
         def whitened(g: int) -> tuple[np.ndarray, np.ndarray]:
             group, pred = problem.groups[g], predictions[g]
-            J = observe_columns(group, jacobian(problem, fit.model, group, pred))
+            J = observe_columns(group, jacobian(problem, fit.model, group, pred).dense())
             return fit.weights.apply(g, residual(group, pred)), fit.weights.apply(g, J)
 
         residuals, columns = zip(*map_threads(whitened, range(len(problem.groups))), strict=True)
@@ -303,24 +303,22 @@ def position_lines(
     loudest = [i for g in range(len(problem.groups)) for i in [k for k in order if groups[k] == g][:each]]
     qs, rs = [qs[i] for i in loudest], [rs[i] for i in loudest]
     spans = [spans[i] for i in loudest]
-    coarse = np.arange(1.0, 260.0) * (0.7 * np.pi / max(spans))
+    step = 0.7 * np.pi / max(spans)
+    coarse = step * np.arange(1, 260)
     power = np.zeros(len(coarse))
     for (q, N), r in zip(qs, rs, strict=True):
-        E = np.exp(1j * np.outer(q - q.mean(), coarse))
+        E = np.multiply(*_waves(q - q.mean(), step, step, len(coarse))).reshape(len(q), -1)[:, : len(coarse)]
         E = E - N @ (N.T @ E)
-        c, s = E.real, E.imag
-        cc, ss, cs = (c * c).sum(0), (s * s).sum(0), (c * s).sum(0)
-        y1, y2 = c.T @ r, s.T @ r
-        det = np.maximum(cc * ss - cs**2, 1e-9 * len(r) ** 2)
-        power += (ss * y1**2 - 2 * cs * y1 * y2 + cc * y2**2) / det
+        sizes = np.einsum("tk,tk->k", E, E.conj()).real, np.einsum("tk,tk->k", E, E)
+        power += _fall(*sizes, r @ E, 1e-9 * len(r) ** 2)
     total = sum(float(r @ r) for r in rs)
     best: list[float] = []
     for k in np.argsort(-power):
-        if all(abs(coarse[k] - b) > 2.5 * (coarse[1] - coarse[0]) for b in best):
+        if all(abs(coarse[k] - b) > 2.5 * step for b in best):
             best.append(float(coarse[k]))
         if len(best) == count or power[k] < 1e-3 * total:
             break
-    return tuple(f for n in best for f in _refine(qs, rs, n, coarse[1] - coarse[0]))
+    return tuple(f for n in best for f in _refine(qs, rs, n, step))
 
 
 def _refine(qs, rs, center: float, width: float, count: int = 4) -> list[float]:
@@ -329,24 +327,47 @@ def _refine(qs, rs, center: float, width: float, count: int = 4) -> list[float]:
     Postures far apart leave a comb of nearly equal maxima; the best of them are all returned.
     """
     spread = np.ptp([q.mean() for q, _ in qs]) + np.ptp(qs[0][0])
-    fine = np.linspace(center - 1.5 * width, center + 1.5 * width, int(np.clip(6 * width * spread, 41, 1500)))
-    power = _coherent_power(qs, rs, fine)
+    count_fine = int(np.clip(6 * width * spread, 41, 1500))
+    first, step = center - 1.5 * width, 3.0 * width / (count_fine - 1)
+    power = _coherent_power(qs, rs, first, step, count_fine)
     peaks = np.flatnonzero((power >= np.roll(power, 1)) & (power >= np.roll(power, -1)))
     out = []
     for k in peaks[np.argsort(-power[peaks])][:count]:
-        near = fine[k] + (fine[1] - fine[0]) * np.linspace(-1, 1, 41)
-        out.append(float(near[np.argmax(_coherent_power(qs, rs, near))]))
+        nearest = first + (k - 1) * step
+        near = _coherent_power(qs, rs, nearest, step / 20, 41)
+        out.append(float(nearest + np.argmax(near) * step / 20))
     return out
 
 
-def _coherent_power(qs, rs, wave_numbers: np.ndarray) -> np.ndarray:
-    """Fall of the squared residual by a sine and a cosine of each wave number."""
-    cc = ss = cs = y1 = y2 = 0.0
-    for (q, _), r in zip(qs, rs, strict=True):
-        stride = max(1, len(q) // 250)
-        E = np.exp(1j * np.outer(q[::stride], wave_numbers))
-        c, s, x = E.real, E.imag, r[::stride]
-        cc, ss, cs = cc + (c * c).sum(0), ss + (s * s).sum(0), cs + (c * s).sum(0)
-        y1, y2 = y1 + c.T @ x, y2 + s.T @ x
-    det = np.maximum(cc * ss - cs**2, 1e-300)
-    return (ss * y1**2 - 2 * cs * y1 * y2 + cc * y2**2) / det
+def _coherent_power(qs, rs, first: float, step: float, count: int) -> np.ndarray:
+    """Fall of the squared residual by a sine and a cosine of each wave number, one phase for all records."""
+    strides = [max(1, len(q) // 250) for q, _ in qs]
+    q = np.concatenate([q[::k] for (q, _), k in zip(qs, strides, strict=True)])
+    r = np.concatenate([r[::k] for r, k in zip(rs, strides, strict=True)])
+    coarse, fine = (x.reshape(len(q), -1) for x in _waves(q, first, step, count))
+    square = ((coarse**2).T @ fine**2).ravel()[:count]
+    moment = ((coarse * r[:, None]).T @ fine).ravel()[:count]
+    return _fall(float(len(q)), square, moment, 1e-300)
+
+
+def _waves(q: np.ndarray, first: float, step: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Factors (T, a, 1) and (T, 1, b) of ``exp(j q w)`` at wave numbers ``w`` from ``first`` in equal steps.
+
+    ``count`` of them or a few more, in the order of ``(a, b)``: an exponential costs far more than a product.
+    """
+    width = int(np.ceil(np.sqrt(count)))
+    coarse = np.exp(1j * np.outer(q, first + step * width * np.arange(-(-count // width))))
+    fine = np.exp(1j * step * np.outer(q, np.arange(width)))
+    return coarse[:, :, None], fine[:, None, :]
+
+
+def _fall(power: np.ndarray | float, square: np.ndarray, moment: np.ndarray, least: float) -> np.ndarray:
+    """Fall of the squared residual by cosine and sine, the real and imaginary parts of waves ``E``.
+
+    Args:
+        power, square, moment: sums over the samples of ``E E*``, ``E E`` and ``E`` times the residual.
+        least: smallest determinant of the normal equations.
+    """
+    cc, ss, cs = 0.5 * (power + square.real), 0.5 * (power - square.real), 0.5 * square.imag
+    det = np.maximum(cc * ss - cs**2, least)
+    return (ss * moment.real**2 - 2 * cs * moment.real * moment.imag + cc * moment.imag**2) / det

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident.columns import Columns
 from ident.extended import Effect, Model, Prediction, predict, predict_at
 from ident.graybox import Parameters, Structure
-from ident.inverse import Sampling, baseline_jacobian
+from ident.inverse import Sampling, baseline_products
 from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
 from ident.records import Group
@@ -81,8 +82,9 @@ class Fit:
         information: (p, p) normal matrix of the fitted coordinates, prior excluded.
         names: of the fitted coordinates.
         remainders: geometric remainder per group, for warm starts.
-        weights: of the last iteration.
+        weights: under which it was made.
         converged: whether the step criterion was met.
+        softer: fits with more error added to the noise that led to this one, if they are known.
     """
 
     model: Model
@@ -93,6 +95,7 @@ class Fit:
     remainders: tuple[np.ndarray, ...]
     weights: Weights
     converged: bool
+    softer: tuple[Fit, ...] = ()
 
     @property
     def chi2_per_dof(self) -> float:
@@ -187,42 +190,71 @@ def unpack(model: Model, x: np.ndarray, limit: float) -> Model:
     return Model(model.structure, par, tuple(effects))
 
 
-def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> np.ndarray:
-    """Derivative of the predicted recorded torque by the fitted coordinates; (S, top, n, p).
-
-    ``top`` is the number of lines that are compared, all of them for a motion.
-    """
+def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> Columns:
+    """Derivative of the predicted recorded torque by the fitted coordinates, at the lines that are compared."""
     m = len(model.par.to_log())
     top = compared_lines(group)
     n, n_e = model.structure.n, len(model.structure.elastic)
-    full = baseline_jacobian(pred.structure, pred.par, pred.plane, pred.solution, top)
     extra = len(pred.structure.elastic) - n_e
-    keep = [*range(4 * n + n_e), *range(4 * n + n_e + extra, 4 * n + n_e + extra + n_e), full.shape[-1] - 1]
-    base = full[..., keep] if extra else full
-    for effect in model.effects:
-        h = effect.hypothesis
-        if h.channel == "drive":
-            motion, j = pred.motion(group), h.joint
-            full = np.zeros((base.shape[-1], *pred.U.shape[:2]), complex)
-            full[:, :, :top] = np.moveaxis(base[:, :, j], -1, 0)
-            passed = h.law(effect.p, motion, j, 0.0, full) - h.law(effect.p, motion, j, 0.0, 0 * full[0])
-            base[:, :, j] = np.moveaxis(passed[:, :, :top], 0, -1)
-    for effect in model.effects:
-        h = effect.hypothesis
-        if h.channel == "spring" and not h.options.get("kinematic"):
-            for c in (h.joint, n + h.joint):
-                x = pack(model)
-                x[c] += 1e-3
-                moved = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W)
-                base[..., c] = (moved.U - pred.U)[:, :top] / 1e-3
-    columns = [base]
-    for i, effect in enumerate(model.effects):
-        for c in range(len(effect.p)):
-            columns.append(_effect_column(problem, model, group, pred, i, c)[:, :top, :, None])
-    out = np.concatenate(columns, axis=-1)
+    keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
+    base = baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
+    late = pred.plane.s[:top, None] * pred.solution.U[:, :top]
+    effects = [
+        column[:, :top]
+        for i in range(len(model.effects))
+        for column in _effect_columns(problem, model, group, pred, i)
+    ]
+    baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
+    baseline = _through_drives(_beside_gears(problem, model, group, pred, baseline), model, group, pred)
     if not problem.free_timing:
-        out[..., m] = 0.0
-    return out
+        baseline.whole[..., baseline.whole_at == m] = 0.0
+    return replace(
+        baseline,
+        whole=np.concatenate([baseline.whole, *(x[..., None] for x in effects)], axis=-1),
+        whole_at=np.concatenate([baseline.whole_at, m + 1 + np.arange(len(effects))]),
+    )
+
+
+def _beside_gears(
+    problem: Problem, model: Model, group: Group, pred: Prediction, columns: Columns
+) -> Columns:
+    """Baseline columns beside laws of the gear, which move with its spring and damper: by differences."""
+    loops = {
+        e.hypothesis.joint
+        for e in model.effects
+        if e.hypothesis.channel == "spring" and not e.hypothesis.options.get("kinematic")
+    }
+    moved = []
+    for c in sorted({c for j in loops for c in (j, model.structure.n + j)}):
+        x = pack(model)
+        x[c] += 1e-3
+        there = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W)
+        moved.append((c, (there.U - pred.U)[:, : columns.whole.shape[1]] / 1e-3))
+    if not moved:
+        return columns
+    kept = np.setdiff1d(columns.product_at, [c for c, _ in moved])
+    return Columns(
+        columns.products.pick(kept),
+        kept,
+        np.concatenate([columns.whole, *(x[..., None] for _, x in moved)], axis=-1),
+        np.concatenate([columns.whole_at, [c for c, _ in moved]]),
+    )
+
+
+def _through_drives(columns: Columns, model: Model, group: Group, pred: Prediction) -> Columns:
+    """Baseline columns of the torque that drives with effects pass on."""
+    drives = [e for e in model.effects if e.hypothesis.channel == "drive"]
+    if not drives:
+        return columns
+    dense = columns.dense()
+    for effect in drives:
+        h, j, motion = effect.hypothesis, effect.hypothesis.joint, pred.motion(group)
+        full = np.zeros((dense.shape[-1], *pred.U.shape[:2]), complex)
+        full[:, :, : dense.shape[1]] = np.moveaxis(dense[:, :, j], -1, 0)
+        passed = h.law(effect.p, motion, j, 0.0, full) - h.law(effect.p, motion, j, 0.0, 0 * full[0])
+        dense[:, :, j] = np.moveaxis(passed[:, :, : dense.shape[1]], 0, -1)
+    none = np.empty(0, int)
+    return Columns(columns.products.pick(none), none, dense, np.arange(dense.shape[-1]))
 
 
 def compared_lines(group: Group) -> int:
@@ -230,40 +262,79 @@ def compared_lines(group: Group) -> int:
     return group.n_compared if group.window is None else len(group.omega)
 
 
-def _effect_column(
-    problem: Problem, model: Model, group: Group, pred: Prediction, i: int, c: int
-) -> np.ndarray:
+def _effect_columns(
+    problem: Problem, model: Model, group: Group, pred: Prediction, i: int
+) -> list[np.ndarray]:
+    """Derivatives (S, L, n) of the predicted torque by the coordinates of effect ``i``, by differences."""
     effect = model.effects[i]
-    h, q = effect.hypothesis, effect.hypothesis.parameters[c]
-    x = q.to_internal(effect.p[c])
-    p = effect.p.copy()
-    step = q.step
-    p[c] = q.to_external(x + step)
-    if p[c] == effect.p[c]:
-        step = -step
+    h, steps = effect.hypothesis, []
+    for c, q in enumerate(h.parameters):
+        x, p, step = q.to_internal(effect.p[c]), effect.p.copy(), q.step
         p[c] = q.to_external(x + step)
+        if p[c] == effect.p[c]:
+            step = -step
+            p[c] = q.to_external(x + step)
+        steps.append((p, step))
     if h.channel == "motor":
-        motion, j = pred.motion(group), h.joint
-        k = pred.par.stiffness[j]
-        change = h.law(p, motion, j, k) - h.law(effect.p, motion, j, k)
-        out = np.zeros_like(pred.U)
-        X = pred.plane.record * motion.lines(change)
-        for other in model.effects:
-            if other.hypothesis.channel == "drive" and other.hypothesis.joint == j:
-                law = other.hypothesis.law
-                X = law(other.p, motion, j, k, X) - law(other.p, motion, j, k, 0 * X)
-        out[..., j] = X
-        return out / step
-    effects = tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects))
-    moved = Model(model.structure, model.par, effects)
+        return _motor_columns(model, group, pred, effect, steps)
+    models = [
+        Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
+        for p, _ in steps
+    ]
+    W, sampling = pred.solution.W, problem.sampling
     if h.channel == "model":
-        U = predict(moved, group, problem.sampling, W=pred.solution.W, steps=1).U
-        base = predict(model, group, problem.sampling, W=pred.solution.W, steps=1).U
-        return (U - base) / step
-    U = predict_at(
-        moved, pred.structure, pred.par, pred.plane, group, problem.sampling, W=pred.solution.W
-    ).U
-    return (U - pred.U) / step
+        base = predict(model, group, sampling, W=W, steps=1).U
+        moved = [predict(m, group, sampling, W=W, steps=1).U for m in models]
+    else:
+        base = pred.U
+        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, sampling, W=W).U for m in models]
+    return [(U - base) / step for U, (_, step) in zip(moved, steps, strict=True)]
+
+
+def _motor_columns(
+    model: Model, group: Group, pred: Prediction, effect: Effect, steps: Sequence[tuple[np.ndarray, float]]
+) -> list[np.ndarray]:
+    """Those of a law at the motor: the motion does not change, and only its own torque does."""
+    h, motion, j = effect.hypothesis, pred.motion(group), effect.hypothesis.joint
+    k = pred.par.stiffness[j]
+    now, columns = h.law(effect.p, motion, j, k), []
+    drives = [e for e in model.effects if e.hypothesis.channel == "drive" and e.hypothesis.joint == j]
+    for p, step in steps:
+        X = pred.plane.record * motion.lines(h.law(p, motion, j, k) - now)
+        for drive in drives:
+            law = drive.hypothesis.law
+            X = law(drive.p, motion, j, k, X) - law(drive.p, motion, j, k, 0 * X)
+        out = np.zeros_like(pred.U)
+        out[..., j] = X / step
+        columns.append(out)
+    return columns
+
+
+def anneal(
+    problem: Problem,
+    model: Model,
+    *,
+    base_names: Sequence[str],
+    ladder: Sequence[float] = ANNEALING,
+    iterations: int = 12,
+    remainders: Sequence[np.ndarray] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Fit:
+    """Fits under less and less error added to the noise (``ladder``), each from where the last one ended."""
+    stages: list[Fit] = []
+    for i, rho in enumerate(ladder):
+        stages.append(
+            fit(
+                problem,
+                stages[-1].model if stages else model,
+                base_names=base_names,
+                rho=rho,
+                iterations=iterations,
+                remainders=stages[-1].remainders if stages else remainders,
+                progress=None if progress is None else lambda text, i=i: progress(f"{text}, stage {i + 1}/{len(ladder)}"),
+            )
+        )
+    return replace(stages[-1], softer=tuple(stages[:-1]))
 
 
 def fit(
@@ -271,7 +342,7 @@ def fit(
     model: Model,
     *,
     base_names: Sequence[str],
-    annealing: Sequence[float] = (0.0,),
+    rho: float = 0.0,
     iterations: int = 12,
     weights: Weights | None = None,
     remainders: Sequence[np.ndarray] | None = None,
@@ -282,9 +353,9 @@ def fit(
     Args:
         model: start.
         base_names: names of the baseline coordinates.
-        annealing: relative errors added to the noise, one after another; end with 0.
-        iterations: at most, in each stage.
-        weights: fixed weights; made anew in every stage where None.
+        rho: relative error added to the noise.
+        iterations: at most.
+        weights: those to fit under; of the start where None.
         remainders: geometric remainders to start from.
     """
     limit = TIMING_LIMIT * problem.sampling.sample_time
@@ -292,69 +363,64 @@ def fit(
     center, prior = _prior(problem, model)
     Ws = list(remainders) if remainders is not None else [None] * len(problem.groups)
     count = data_count(problem)
-    fixed = weights
+    x = pack(model)
+    preds = predictions(problem, model, Ws, steps=None if Ws[0] is None else 1)
+    Ws = [p.solution.W for p in preds]
+    if weights is None:
+        weights = make_weights(problem, preds, rho)
+    cost = weighted_cost(problem, preds, weights)
+    # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
+    trial_steps = int(any(e.hypothesis.channel == "model" for e in model.effects))
+    moves, drift = _moves_links(model), np.zeros(len(x))
+    damping = 1e-3
     converged = False
-    preds: list[Prediction] = []
-    for stage, rho in enumerate(annealing):
-        x = pack(model)
-        preds = predictions(problem, model, Ws, steps=None if Ws[0] is None else 1)
-        Ws = [p.solution.W for p in preds]
-        weights = fixed if fixed is not None else make_weights(problem, preds, rho)
-        cost = weighted_cost(problem, preds, weights)
-        # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
-        trial_steps = int(any(e.hypothesis.channel == "model" for e in model.effects))
-        moves, drift = _moves_links(model), np.zeros(len(x))
-        damping = 1e-3
-        converged = False
-        for _ in range(iterations):
-            H, b = _normal(problem, model, preds, weights)
-            off = x - center
-            H_p, b_p = H + np.diag(prior), b - prior * off
-            size = np.diag(H_p).copy()
-            size[size <= 0] = 1.0
-            improved = False
-            for _ in range(6):
-                step = np.linalg.solve(H_p + damping * np.diag(size), b_p)
-                step[:m] = np.clip(step[:m], -1.0, 1.0)
-                step[m + 1 :] = _clip_effects(model, step[m + 1 :])
-                step[:m] = np.clip(x[:m] + step[:m], center[:m] - LOG_RANGE, center[:m] + LOG_RANGE) - x[:m]
-                trial = unpack(model, x + step, limit)
-                try:
-                    new = predictions(problem, trial, Ws, steps=trial_steps)
-                    new_cost = weighted_cost(problem, new, weights)
-                except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-                    new_cost = np.inf
-                penalty = np.sum(prior * ((off + step) ** 2 - off**2))
-                if np.isfinite(new_cost) and new_cost + penalty < cost:
-                    improved = True
-                    break
-                damping = max(damping, 1e-4) * 8
-            if not improved:
-                converged = True
+    for _ in range(iterations):
+        H, b = _normal(problem, model, preds, weights)
+        off = x - center
+        H_p, b_p = H + np.diag(prior), b - prior * off
+        size = np.diag(H_p).copy()
+        size[size <= 0] = 1.0
+        improved = False
+        for _ in range(6):
+            step = np.linalg.solve(H_p + damping * np.diag(size), b_p)
+            step[:m] = np.clip(step[:m], -1.0, 1.0)
+            step[m + 1 :] = _clip_effects(model, step[m + 1 :])
+            step[:m] = np.clip(x[:m] + step[:m], center[:m] - LOG_RANGE, center[:m] + LOG_RANGE) - x[:m]
+            trial = unpack(model, x + step, limit)
+            try:
+                new = predictions(problem, trial, Ws, steps=trial_steps)
+                new_cost = weighted_cost(problem, new, weights)
+            except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+                new_cost = np.inf
+            penalty = np.sum(prior * ((off + step) ** 2 - off**2))
+            if np.isfinite(new_cost) and new_cost + penalty < cost:
+                improved = True
                 break
-            gain = cost - new_cost
-            drift += np.abs(pack(trial) - x)
-            model, x = trial, pack(trial)
-            damping = max(damping / 10, 1e-9)
-            preds, cost = new, new_cost
-            if np.max(np.where(moves, drift, 0.0)) > STALE:
-                preds = predictions(problem, model, Ws, steps=1)
-                Ws = [p.solution.W for p in preds]
-                cost = weighted_cost(problem, preds, weights)
-                drift[:] = 0.0
-            if progress is not None:
-                progress(f"fit: stage {stage + 1}/{len(annealing)}, chi2/dof {cost / count:.3g}")
-            if gain < max(GAP * cost, 0.02):
-                converged = True
-                break
+            damping = max(damping, 1e-4) * 8
+        if not improved:
+            converged = True
+            break
+        gain = cost - new_cost
+        drift += np.abs(pack(trial) - x)
+        model, x = trial, pack(trial)
+        damping = max(damping / 10, 1e-9)
+        preds, cost = new, new_cost
+        if np.max(np.where(moves, drift, 0.0)) > STALE:
+            preds = predictions(problem, model, Ws, steps=1)
+            Ws = [p.solution.W for p in preds]
+            cost = weighted_cost(problem, preds, weights)
+            drift[:] = 0.0
+        if progress is not None:
+            progress(f"fit: chi2/dof {cost / count:.3g}")
+        if gain < max(GAP * cost, 0.02):
+            converged = True
+            break
     if np.any(drift):
         preds = predictions(problem, model, Ws, steps=1)
         Ws = [p.solution.W for p in preds]
         cost = weighted_cost(problem, preds, weights)
     H, _ = _normal(problem, model, preds, weights)
-    return Fit(
-        model, cost, count, H, coordinate_names(model, base_names), tuple(Ws), weights, converged
-    )
+    return Fit(model, cost, count, H, coordinate_names(model, base_names), tuple(Ws), weights, converged)
 
 
 def _moves_links(model: Model) -> np.ndarray:
@@ -416,8 +482,11 @@ def _normal(
 ) -> tuple[np.ndarray, np.ndarray]:
     def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
         group, pred = problem.groups[g], preds[g]
-        J = as_real(weights.apply(g, observe_columns(group, jacobian(problem, model, group, pred))))
-        r = as_real(weights.apply(g, residual(group, pred))[..., None])[:, 0]
+        columns, error = jacobian(problem, model, group, pred), residual(group, pred)
+        if group.window is None:
+            return columns.normal(weights.whiten[g], error)
+        J = as_real(weights.apply(g, observe_columns(group, columns.dense())))
+        r = as_real(weights.apply(g, error)[..., None])[:, 0]
         return J.T @ J, J.T @ r
 
     H, b = zip(*map_threads(of_group, range(len(problem.groups))), strict=True)

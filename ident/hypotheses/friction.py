@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
-from ident.hypotheses.kernels import bristle
+from ident.hypotheses.kernels import bristle, smooth_sign
 from ident.inverse import Motion
 
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
@@ -18,9 +18,7 @@ def direction(v: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
     with its own time: a plain sign would add broadband noise of the size of the step. A smoothing
     velocity widens the reversal as regularised and presliding friction do.
     """
-    slope = 0.25 * np.abs(np.roll(v, -1, axis=-1) - np.roll(v, 1, axis=-1))
-    x = v / np.maximum(slope, 1e-300)
-    return np.clip(x, -1.0, 1.0) if smoothing <= 0 else np.tanh(v / np.hypot(slope * 0.6, smoothing))
+    return smooth_sign(np.ascontiguousarray(v), float(smoothing))
 
 
 def coulomb_friction(joint: int, place: str) -> Hypothesis:

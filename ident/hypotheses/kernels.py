@@ -1,6 +1,6 @@
-"""Laws with memory, stepped along time in compiled code.
+"""Laws of friction and of gears along time, in compiled code.
 
-Each takes (S, T) signals over one period and returns the periodic steady state: the period is run
+Those with memory are stepped. Each takes (S, T) signals over one period and returns the periodic steady state: the period is run
 again until it repeats (friction elements forget in one).
 """
 
@@ -9,8 +9,28 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+TURNED = 19.1  # argument beyond which tanh is one in double precision
 SWEEPS = 25  # periods at most until the steady state
 CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK = 0, 1, 2, 3, 4
+
+
+@njit(cache=True, nogil=True)
+def smooth_sign(v: np.ndarray, smoothing: float) -> np.ndarray:
+    """Sign of ``v`` (S, T), averaged over each step of the grid, in which ``v`` goes along a line.
+
+    A ``smoothing`` above zero widens the turn to ``tanh`` of that width, or of that of the step.
+    """
+    S, T = v.shape
+    out = np.empty((S, T))
+    for i in range(S):
+        for k in range(T):
+            slope = 0.25 * abs(v[i, (k + 1) % T] - v[i, k - 1])
+            if smoothing <= 0:
+                out[i, k] = min(max(v[i, k] / max(slope, 1e-300), -1.0), 1.0)
+                continue
+            x = v[i, k] / np.sqrt(0.36 * slope * slope + smoothing * smoothing)
+            out[i, k] = np.tanh(x) if abs(x) < TURNED else np.sign(x)
+    return out
 
 
 @njit(cache=True, nogil=True)
