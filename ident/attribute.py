@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from ident.extended import Effect, Model, Prediction
+from ident.extended import Effect, Model
 from ident.graybox import parameter_names
 from ident.hypotheses import Hypothesis, Parameter, catalogue
 from ident.parallel import map_threads
@@ -37,10 +37,12 @@ DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
+FAINT = 3.0  # chi2 per degree of freedom up to which no strong effects are tried beyond the screened ones
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
-STRONG_STEPS = 10  # the same of a strong effect
+STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
+NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 ANSWERED = 0.2  # share of the excess that the best may leave where no strong effects are tried beyond the screened ones
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 HOPEFUL = 5  # candidates fitted further after the first steps
@@ -249,8 +251,7 @@ def attribute_once(
     else:
         found, scores = [], []
     excess = max(current.cost - current.count, 1.0)
-    left = min((r.cost - r.count for _, r in found), default=np.inf)
-    if current.chi2_per_dof > STRONG and left > SETTLED * excess:
+    if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess:
         before, found, scores = explore_softly(problem, current, found, hypotheses, progress)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
@@ -258,8 +259,9 @@ def attribute_once(
             best[id(h)] = h, result
     if not best:
         return Round(before, (), tuple(scores), 1.0)
-    ranked = sorted(best.values(), key=lambda x: x[1].cost)
-    before, ranked = under_noise_of_best(problem, before, ranked)
+    before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost))
+    if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count:
+        before, ranked = beside_strong(problem, before, ranked, scores, progress)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in ranked], before.count)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     return Round(before, tuple(weighed), tuple(scores), scale)
@@ -343,33 +345,30 @@ def explore(
     preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
-    if not scores or not (regardless or scores[0].gain > WORTH_A_REFIT * excess):
+    worth = WORTH_A_REFIT * (1.0 if stage.chi2_per_dof > FAINT else 2.0)
+    if not scores or not (regardless or scores[0].gain > worth * excess):
         return [], scores
 
-    def started(task: tuple[Score, int]) -> tuple[Hypothesis, Fit | None]:
-        score, steps = task
+    def started(score: Score) -> tuple[Hypothesis, Fit | None]:
         h = score.hypothesis
         if progress is not None:
             progress(f"refit: {h.effect} at {h.place}")
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
-        return h, refit(problem, model, stage.weights, stage.remainders, steps)
-
-    def first_steps(chosen: Sequence[Score], steps: int) -> list[tuple[Hypothesis, Fit]]:
-        return [(h, r) for h, r in map_threads(started, [(score, steps) for score in chosen]) if r is not None]
+        return h, refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
 
     def finished(candidate: tuple[Hypothesis, Fit]) -> tuple[Hypothesis, Fit]:
         h, r = candidate
         return h, r if r.converged else refit(problem, r.model, stage.weights, r.remainders) or r
 
-    chosen = choose(scores)
-    found = first_steps(chosen, FIRST_STEPS)
-    answered = min((r.cost - r.count for _, r in found), default=np.inf) < ANSWERED * excess
-    if not answered:
-        found += first_steps(strong_effects(problem, stage, preds, scores), STRONG_STEPS)
-    found = hopeful(found)
-    if not (rough and answered):
+    found = hopeful([(h, r) for h, r in map_threads(started, choose(scores)) if r is not None])
+    if not (rough and left_by(found) < ANSWERED * excess):
         found = map_threads(finished, found)
     return sorted(found, key=lambda x: x[1].cost), scores
+
+
+def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
+    """Excess of the cost over noise that the best candidate leaves; infinite where there is none."""
+    return min((r.cost - r.count for _, r in found), default=np.inf)
 
 
 def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:
@@ -395,7 +394,7 @@ def refit(
             weights=weights,
             remainders=remainders,
         )
-    except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError):
+    except NOT_COMPUTED:
         return None
 
 
@@ -413,20 +412,53 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     return out
 
 
-def strong_effects(
-    problem: Problem, stage: Fit, preds: Sequence[Prediction], scores: Sequence[Score]
-) -> list[Score]:
-    """Friction and the laws of the gear at the joint that carries most of the discrepancy, of a strong size.
+def beside_strong(
+    problem: Problem,
+    before: Fit,
+    ranked: Sequence[tuple[Hypothesis, Fit]],
+    scores: Sequence[Score],
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
+    """Candidates, and the model without them, beside strong effects where one of those does better.
+
+    A strong effect that is missing moves the drives to where none of its steps leads back, and with
+    them the noise that the model passes on: a joint that sticks looks like one without motor inertia.
+    Strong effects are therefore fitted from the starting guesses of the drives, under their own noise.
+    """
+
+    def annealed(score: Score) -> tuple[Hypothesis, Fit | None]:
+        h = score.hypothesis
+        if progress is not None:
+            progress(f"strong: {h.effect} at {h.place}")
+        start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
+        names = parameter_names(problem.structure.robot)
+        try:
+            return h, anneal(problem, start, base_names=names, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
+        except NOT_COMPUTED:
+            return h, None
+
+    likely = min(ranked, key=lambda x: x[1].cost)[0].joint
+    chosen = strong_effects(problem, before, scores, likely)
+    strong = [(h, r) for h, r in map_threads(annealed, chosen) if r is not None]
+    if not left_by(strong) < left_by(ranked):
+        return before, list(ranked)
+    again = {h.key for h, _ in strong}
+    others = [(h, r) for h, r in ranked if h.key not in again]
+    return under_noise_of_best(problem, before, sorted(strong, key=lambda x: x[1].cost) + others)
+
+
+def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely: int) -> list[Score]:
+    """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
 
     A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
     of the time hardly shows its inertia: the linear step of a score says little about either.
     """
+    preds = predictions(problem, stage.model, stage.remainders)
     loudest = int(np.argmax(joint_costs(problem, preds, stage.weights)))
-    scale = signal_scale(problem, preds, loudest, ())
     return [
-        replace(s, start=s.hypothesis.options["size"](scale))
+        replace(s, start=s.hypothesis.options["size"](signal_scale(problem, preds, s.hypothesis.joint, ())))
         for s in scores
-        if s.hypothesis.joint == loudest and "size" in s.hypothesis.options
+        if s.hypothesis.joint in {loudest, likely} and "size" in s.hypothesis.options
     ]
 
 

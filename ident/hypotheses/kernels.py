@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 TURNED = 19.1  # argument beyond which tanh is one in double precision
+VECTORS = {"contract", "reassoc", "nsz"}  # what lets the compiler step several records at once
 SWEEPS = 25  # periods at most until the steady state
 CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK = 0, 1, 2, 3, 4
 
@@ -93,11 +94,11 @@ def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: floa
 
 @njit(cache=True, nogil=True)
 def spring_point(
-    code: int, a: float, b: float, k: float, free: float, direct: float, x_old: float, h_old: float
+    code: int, a: float, b: float, k: float, free: float, direct: float, x_old: float, x_older: float, h_old: float
 ) -> float:
     """Deflection ``x`` that solves ``x + direct h(x) = free``: a rising function of ``x``."""
     if code == 0:
-        x = x_old
+        x = 2.0 * x_old - x_older
         for _ in range(60):
             step = (x + direct * a * x * x * x - free) / (1.0 + 3.0 * direct * a * x * x)
             x -= step
@@ -149,16 +150,7 @@ def link_point(
     return h
 
 
-@njit(cache=True, nogil=True)
-def periodic_start(start: np.ndarray, end: np.ndarray, decay: np.ndarray, T: int) -> None:
-    """Replace ``start`` by the state that the torque of a period repeats; ``end`` as it left off."""
-    for m in range(len(start)):
-        whole = decay[m] ** T
-        start[m] = (end[m] - whole * start[m]) / (1.0 - whole)
-        end[m] = start[m]
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=VECTORS)
 def steady_loop(
     code: int,
     a: float,
@@ -175,7 +167,7 @@ def steady_loop(
 
     ``x = linear - r * h(x, x')`` with ``r`` the compliance of the arm at the law, as a sum of modes stepped
     with a first-order hold: ``x+ = decay x + gain_old h + gain_new h+``. The velocity is that of the modes
-    (residues add up to zero: a torque does not step a velocity).
+    (residues add up to zero: a torque does not step a velocity). All records are stepped side by side.
 
     Args:
         code, a, b, k: law. Of a gear, its two parameters and the linear stiffness, N m/rad; ``LINK``:
@@ -185,45 +177,67 @@ def steady_loop(
     """
     S, T = linear.shape
     modes = len(decay)
-    out = np.zeros((S, T))
-    direct = 0.0
-    direct_rate = 0.0
-    for m in range(modes):
-        direct += gain_new[m].real
-        direct_rate += (poles[m] * gain_new[m]).real
-    state = np.zeros(modes, np.complex128)
-    start = np.zeros(modes, np.complex128)
+    linear, rate = linear.T.copy(), rate.T.copy()
+    out = np.zeros((T, S))
+    # A mode without the share of the torque of this step: that of the next one follows from both in one go.
+    gain = decay * gain_new + gain_old
+    whole = decay**T
+    direct = gain_new.real.sum()
+    direct_rate = (poles * gain_new).real.sum()
+    re, im = np.zeros((modes, S)), np.zeros((modes, S))
+    start = np.zeros((modes, S), np.complex128)
+    x, past, h = np.empty(S), np.empty(S), np.empty(S)
+    free, free_rate = np.empty(S), np.zeros(S)
+    change, largest = np.zeros(S), np.zeros(S)
     for i in range(S):
-        state[:] = 0.0
-        start[:] = 0.0
-        x = linear[i, T - 1]
-        h = a * x + b * np.tanh(rate[i, T - 1] / k) if code == 4 else spring_torque(code, a, b, k, x, x, 0.0)
-        for sweep in range(SWEEPS):
-            change = 0.0
-            largest = 0.0
-            for t in range(T):
-                free = linear[i, t]
+        x[i] = past[i] = linear[T - 1, i]
+        h[i] = a * x[i] + b * np.tanh(rate[T - 1, i] / k) if code == 4 else spring_torque(code, a, b, k, x[i], x[i], 0.0)
+    for sweep in range(SWEEPS):
+        for m in range(modes):
+            for i in range(S):
+                state = decay[m] * start[m, i] + gain_old[m] * h[i]
+                re[m, i], im[m, i] = state.real, state.imag
+        change[:] = 0.0
+        largest[:] = 0.0
+        for t in range(T):
+            for i in range(S):
+                free[i] = linear[t, i]
+            for m in range(modes):
+                for i in range(S):
+                    free[i] -= re[m, i]
+            if code == 4:
+                for i in range(S):
+                    free_rate[i] = rate[t, i]
                 for m in range(modes):
-                    state[m] = decay[m] * state[m] + gain_old[m] * h
-                    free -= state[m].real
-                if code == 4:
-                    free_rate = rate[i, t]
-                    for m in range(modes):
-                        free_rate -= (poles[m] * state[m]).real
-                    h = link_point(a, b, k, free, free_rate, direct, direct_rate, h)
-                else:
-                    new = spring_point(code, a, b, k, free, direct, x, h)
-                    h = spring_torque(code, a, b, k, new, x, h)
-                    x = new
-                for m in range(modes):
-                    state[m] += gain_new[m] * h
-                change = max(change, abs(h - out[i, t]))
-                largest = max(largest, abs(h))
-                out[i, t] = h
-            if sweep > 0 and change <= 1e-5 * largest:
-                break
-            periodic_start(start, state, decay, T)
-    return out
+                    p, w = poles[m].real, poles[m].imag
+                    for i in range(S):
+                        free_rate[i] -= p * re[m, i] - w * im[m, i]
+                for i in range(S):
+                    h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate, h[i])
+            else:
+                for i in range(S):
+                    new = spring_point(code, a, b, k, free[i], direct, x[i], past[i], h[i])
+                    h[i] = spring_torque(code, a, b, k, new, x[i], h[i])
+                    past[i] = x[i]
+                    x[i] = new
+            for m in range(modes):
+                d, e, f, g = decay[m].real, decay[m].imag, gain[m].real, gain[m].imag
+                for i in range(S):
+                    old = re[m, i]
+                    re[m, i] = d * old - e * im[m, i] + f * h[i]
+                    im[m, i] = d * im[m, i] + e * old + g * h[i]
+            for i in range(S):
+                change[i] = max(change[i], abs(h[i] - out[t, i]))
+                largest[i] = max(largest[i], abs(h[i]))
+                out[t, i] = h[i]
+        if sweep > 0 and np.all(change <= 1e-5 * largest):
+            break
+        for m in range(modes):
+            for i in range(S):
+                # The state that the torque of this period repeats.
+                end = (complex(re[m, i], im[m, i]) - gain_old[m] * h[i]) / decay[m]
+                start[m, i] = (end - whole[m] * start[m, i]) / (1.0 - whole[m])
+    return out.T.copy()
 
 
 def modal_compliance(
