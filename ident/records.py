@@ -219,7 +219,8 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
     tau = close_motion(segment.tau, n_return)
     top = min(int(band_hz * N / fs), N // 2 - 1)
     n_lines = min(int(1.5 * top) + 2, N // 2)
-    n_time = scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True)
+    # A ripple is fast along a motion that is slow: on a grid of the compared band alone it would fold into it.
+    n_time = max(N, scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True))
     time = np.arange(n_time) * N / fs / n_time
     ramp = min(SETTLE_TIME, 0.1 * len(segment.t) / fs)
     end = len(segment.t) / fs
