@@ -5,13 +5,10 @@ from __future__ import annotations
 import io
 from itertools import pairwise
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
+import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace
 
@@ -68,10 +65,15 @@ def rounded(value: float, std: float) -> str:
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
-def _svg(fig) -> str:
+def _subplots(rows: int = 1, columns: int = 1, **options):
+    """Figure and axes that no window and no notebook of the caller knows of."""
+    fig = Figure(**{k: options.pop(k) for k in ("figsize", "layout") if k in options})
+    return fig, fig.subplots(rows, columns, **options)
+
+
+def _svg(fig: Figure) -> str:
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", bbox_inches="tight", transparent=True, metadata={"Date": None})
-    plt.close(fig)
     text = buffer.getvalue()
     for colour, variable in CSS.items():
         text = text.replace(colour, variable)
@@ -107,8 +109,8 @@ def frf_figure(view: FrfView, joints: tuple[str, ...]) -> str:
     n = len(joints)
     columns = min(n, 3)
     rows = -(-n // columns)
-    with plt.rc_context(STYLE):
-        fig, axes = plt.subplots(
+    with mpl.rc_context(STYLE):
+        fig, axes = _subplots(
             rows, columns, figsize=(3.5 * columns, 2.3 * rows + 0.3), sharex=True, squeeze=False, layout="constrained"
         )
         for ax in axes.flat[n:]:
@@ -125,8 +127,8 @@ def frf_figure(view: FrfView, joints: tuple[str, ...]) -> str:
 def frf_picture(view: FrfView, joints: tuple[str, ...], shown: list[str]) -> bytes:
     """Diagonal entries of some joints as PNG on black, for the recording."""
     style = {key: DARK.get(value, value) for key, value in STYLE.items()}
-    with plt.rc_context(style | {"font.size": 9}):
-        fig, axes = plt.subplots(1, len(shown), figsize=(5 * len(shown), 3.1), squeeze=False, layout="constrained")
+    with mpl.rc_context(style | {"font.size": 9}):
+        fig, axes = _subplots(1, len(shown), figsize=(5 * len(shown), 3.1), squeeze=False, layout="constrained")
         for name, ax in zip(shown, axes.flat, strict=True):
             j = joints.index(name)
             _draw_response(ax, view, j, j, 4.0, DARK)
@@ -136,15 +138,14 @@ def frf_picture(view: FrfView, joints: tuple[str, ...], shown: list[str]) -> byt
         _legend(fig, axes[0][0])
         buffer = io.BytesIO()
         fig.savefig(buffer, format="png", dpi=150, facecolor="#0d0d0d")
-        plt.close(fig)
         return buffer.getvalue()
 
 
 def frf_grid_figure(view: FrfView, joints: tuple[str, ...]) -> str:
     """Gain of all entries of one operating point: torque of the column, acceleration of the row."""
     n = len(joints)
-    with plt.rc_context(STYLE | {"xtick.labelsize": 5, "ytick.labelsize": 5}):
-        fig, axes = plt.subplots(
+    with mpl.rc_context(STYLE | {"xtick.labelsize": 5, "ytick.labelsize": 5}):
+        fig, axes = _subplots(
             n, n, figsize=(11, 1.25 * n + 0.6), sharex=True, squeeze=False, layout="constrained"
         )
         for i in range(n):
@@ -159,10 +160,10 @@ def frf_grid_figure(view: FrfView, joints: tuple[str, ...]) -> str:
 
 def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...]) -> str:
     """Residual over noise by operating point, joint and band, before and after; and the noise."""
-    with plt.rc_context(STYLE | {"axes.grid": False, "axes.spines.left": False, "axes.spines.bottom": False}):
+    with mpl.rc_context(STYLE | {"axes.grid": False, "axes.spines.left": False, "axes.spines.bottom": False}):
         points, edges = spectrum.operating_points, spectrum.band_edges_hz
         n, rows = len(joints), len(points) * len(joints)
-        fig, axes = plt.subplots(1, 3, figsize=(11, 0.17 * rows + 1.5), sharey=True, layout="constrained")
+        fig, axes = _subplots(1, 3, figsize=(11, 0.17 * rows + 1.5), sharey=True, layout="constrained")
         noise = np.maximum(spectrum.noise, 1e-12)
         top = max(10.0, float(np.nanmax(spectrum.before / noise)))
         ratio = {"norm": LogNorm(1.0, top, clip=True), "cmap": "YlOrRd"}
@@ -191,8 +192,8 @@ def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...]) -> str:
 
 def evidence_figure(plot: EvidencePlot) -> str:
     """Residual torque against the variable that explains it."""
-    with plt.rc_context(STYLE):
-        fig, ax = plt.subplots(figsize=(5.2, 3.3), layout="constrained")
+    with mpl.rc_context(STYLE):
+        fig, ax = _subplots(figsize=(5.2, 3.3), layout="constrained")
         ax.plot(*_thin(plot.x, plot.y), ".", ms=2.2, mew=0, alpha=0.45, color=MEASURED, label="residual without the cause")
         ax.plot(*_thin(plot.model_x, plot.model_y), ".", ms=2.2, mew=0, alpha=0.7, color=AFTER, label="fitted effect")
         ax.set_xlabel(plot.x_label)
@@ -206,8 +207,8 @@ def trace_figure(trace: TorqueTrace, joints: tuple[str, ...]) -> str:
     before = (trace.measured - trace.before).std(axis=0)
     scale = np.maximum(trace.measured.std(axis=0), 1e-9)
     worst = np.sort(np.argsort(-before / scale)[: min(3, len(joints))])
-    with plt.rc_context(STYLE):
-        fig, axes = plt.subplots(len(worst), 1, figsize=(11, 1.4 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained")
+    with mpl.rc_context(STYLE):
+        fig, axes = _subplots(len(worst), 1, figsize=(11, 1.4 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained")
         step = max(1, len(trace.t) // POINTS)
         for ax, j in zip(axes.flat, worst, strict=True):
             t = trace.t[::step]
