@@ -95,7 +95,7 @@ def experiment(
     realizations: Annotated[int, typer.Option(min=1)] = 1,
     points: Annotated[int, typer.Option(min=1, help="Operating points for identification.")] = 2,
     drives: Annotated[str, typer.Option(help='"nominal", or "drawn" within a factor of two.')] = "nominal",
-    plan: Annotated[Path | None, typer.Option(help="A plan written by `simgap design`.")] = None,
+    plan: Annotated[Path | None, typer.Option(help="A plan written by `simgap design`, or next_plan.toml of a diagnosis.")] = None,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:

@@ -24,6 +24,7 @@ from ident.graybox import (
 )
 from ident.inverse import Sampling
 from ident.link_sensor import LinkDelay, find_link_delays
+from ident.next_experiment import NextExperiment, separating_experiment
 from ident.noise import sample_noise
 from ident.parallel import map_threads, one_thread_each
 from ident.quantization import Steps, find_steps
@@ -181,7 +182,8 @@ def diagnose_fully(
     say("evidence")
     last = predictions(problem, after, result.final.remainders)
     late = find_link_delays(problem, last)
-    verdict = make_verdict(dataset, setup, result, gain, first, last, late)
+    separating = separating_experiment(problem, result)
+    verdict = make_verdict(dataset, setup, result, gain, first, last, late, separating)
     kept = result.rounds if len(verdict.causes) else ()
     return Diagnosis(
         verdict=verdict,
@@ -195,6 +197,7 @@ def diagnose_fully(
         traces=torque_traces(dataset, shown, pairs),
         parameters={k: v.value for k, v in baseline_values(result.final)[0].items()},
         seconds=time.perf_counter() - began,
+        next_plan=separating.plan if separating else None,
         candidates=tuple(
             tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
         ),
@@ -239,6 +242,7 @@ def make_verdict(
     first: Sequence[Prediction],
     last: Sequence[Prediction],
     late: Sequence[LinkDelay] = (),
+    separating: NextExperiment | None = None,
 ) -> Verdict:
     """Put the result into the words and numbers of verdict.json."""
     final = result.final
@@ -281,7 +285,7 @@ def make_verdict(
         unexplained_share=float(left),
         unexplained_verdict=verdict,
         gain=gain,
-        next_experiment=next_experiment(causes, unknown),
+        next_experiment=separating.text if separating else next_experiment(causes, unknown),
         sentence=sentence(causes, unknown, detected, gain),
         unidentified=undetermined,
         residual_description=description,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ident.excitation import Plan
 from robot_assets.robot import Robot
 
 SCHEMA = "simgap-verdict/1"
@@ -197,6 +198,7 @@ class Diagnosis:
     parameters: dict[str, float]
     seconds: float
     candidates: tuple[tuple[tuple[str, str, float], ...], ...] = field(default=())
+    next_plan: Plan | None = None
 
 
 def _plain(x: Any) -> Any:

@@ -1,0 +1,184 @@
+"""What to measure next, where two hypotheses explain the data alike.
+
+Both fitted models predict the torque along motions that were not made yet: those of the recorded
+experiments, smaller, larger, and in other postures. An experiment tells them apart by what the
+torque of one differs from that of the other after the other has been refitted to it, under the
+information that the recorded data already hold (the T-criterion of Atkinson and Fedorov, Biometrika
+62, 1975, to first order in the parameters).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.attribute import Attribution, Candidate
+from ident.excitation import Plan, make_plan
+from ident.extended import predict
+from ident.graybox import Parameters, equilibrium, linearise
+from ident.parallel import map_threads
+from ident.records import Group
+from ident.torque_fit import Fit, Problem, jacobian, make_weights
+from robot_assets.robot import linear_joints
+
+TIED = 0.1  # probability from which a second hypothesis is worth an experiment
+ENOUGH = 5.0  # nats of expected evidence that settle a tie
+FACTORS = (0.25, 0.5, 1.0, 2.0)  # on the motion of the largest level
+SHIFTS = (-0.6, 0.0, 0.6)  # rad or m of the joint in question
+RECORDS = 6  # of a posture that are looked at
+TORQUE_SHARE = 0.9  # of the torque limit that a planned motion may take
+LEVELS = (1.0, 0.5, 0.25)  # of a planned experiment, in units of the largest
+MANY = 1000.0  # nats above which their number says no more: it is of first order
+PERIODS = 3  # of a planned multisine, the first a transient
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """The experiment that separates two hypotheses best, of those that were thought of.
+
+    Attributes:
+        text: what to measure, and what is expected of it.
+        nats: expected evidence between the two, per operating point.
+        plan: the same for ``simgap experiment --plan``; None where nothing separates them.
+    """
+
+    text: str
+    nats: float
+    plan: Plan | None
+
+
+@dataclass(frozen=True)
+class _Option:
+    group: Group
+    factor: float
+    joint: int
+    shift: float
+
+
+def separating_experiment(problem: Problem, result: Attribution) -> NextExperiment | None:
+    """For the least certain cause with a rival; None where there is none, or no periodic data."""
+    pair = _rivals(result)
+    groups = [g for g in problem.groups if g.window is None]
+    if pair is None or not groups:
+        return None
+    a, b = pair
+    options = list(_options(problem, groups, a.hypothesis.joint))
+    nats = map_threads(lambda option: _separation(problem, option, a.fit, b.fit), options)
+    best = int(np.argmax(nats))
+    names = f"{a.hypothesis.effect} at {a.hypothesis.place} from {b.hypothesis.effect} at {b.hypothesis.place}"
+    if not nats[best] > ENOUGH:
+        text = (
+            f"To tell {names}: no other amplitude or posture would; of {len(options)} experiments the best is expected"
+            f" to give {max(nats[best], 0.0):.1f} nats. A wider band or a slow sweep may."
+        )
+        return NextExperiment(text, float(nats[best]), None)
+    o = options[best]
+    robot = problem.structure.robot
+    unit = "m" if linear_joints(robot)[o.joint] else "rad"
+    where = f"the posture of {o.group.operating_point}" + (f" with {robot.joint_names[o.joint]} moved by {o.shift:+g} {unit}" if o.shift else "")
+    size = "the same amplitude" if o.factor == 1.0 else f"{o.factor:g} times the amplitude"
+    expected = f"{nats[best]:.0f}" if nats[best] < MANY else f"more than {MANY:.0f}"
+    text = f"To tell {names}: {where}, at {size}; expected to give {expected} nats between them (next_plan.toml)."
+    return NextExperiment(text, float(nats[best]), _plan(problem, o))
+
+
+def _rivals(result: Attribution) -> tuple[Candidate, Candidate] | None:
+    """The winner of the least certain round and its best rival of another name or place."""
+    pairs = []
+    for found in result.rounds:
+        first = found.candidates[0]
+        key = (first.hypothesis.effect, first.hypothesis.place)
+        rivals = [
+            c
+            for c in found.candidates[1:]
+            if (c.hypothesis.effect, c.hypothesis.place) != key and not c.hypothesis.decoy and c.probability >= TIED
+        ]
+        if rivals and not first.hypothesis.decoy:
+            pairs.append((first, rivals[0]))
+    return min(pairs, key=lambda p: p[0].probability, default=None)
+
+
+def _options(problem: Problem, groups: Sequence[Group], joint: int) -> Iterator[_Option]:
+    """Every amplitude and posture of a joint; postures alone, of every joint, for what has no joint (-1)."""
+    robot = problem.structure.robot
+    limit = TORQUE_SHARE * robot.array("torque_limit")
+    for group in groups:
+        rows = np.argsort(-group.amplitude, kind="stable")[:RECORDS]
+        top = thinned(group, rows[group.amplitude[rows] == group.amplitude.max()])
+        for j in range(robot.n) if joint < 0 else (joint,):
+            for factor in (1.0,) if joint < 0 else FACTORS:
+                if factor > 1.0 and np.any(np.abs(top.U[:, 0]).max(axis=0) + factor * _peak(top) > limit):
+                    continue
+                for shift in SHIFTS:
+                    inside = robot.q_min[j] < top.posture[j] + shift < robot.q_max[j]
+                    if (factor, shift) != (1.0, 0.0) and (inside or shift == 0.0):
+                        yield _Option(moved(top, factor, j, shift), factor, j, shift)
+
+
+def thinned(group: Group, rows: np.ndarray) -> Group:
+    """A group with some of its records."""
+    names = ("U", "Q", "U_periods", "Q_periods", "excited", "amplitude", "start", "periods")
+    kept = {name: getattr(group, name)[rows] for name in names}
+    kept |= {name: getattr(group, name)[rows] for name in ("Q_link", "temperature") if getattr(group, name) is not None}
+    return replace(group, segments=tuple(group.segments[i] for i in rows), **kept)
+
+
+def moved(group: Group, factor: float, joint: int, shift: float) -> Group:
+    """The same motion ``factor`` times as large, about a posture shifted at one joint."""
+    scale = np.full((1, len(group.omega), 1), factor)
+    scale[:, 0] = 1.0
+    Q = scale * group.Q
+    Q[:, 0, joint] += shift
+    return replace(group, Q=Q, U=scale * group.U, amplitude=factor * group.amplitude)
+
+
+def _peak(group: Group) -> np.ndarray:
+    U = group.U.copy()
+    U[:, 0] = 0.0
+    return np.abs(group.to_time(U)).max(axis=(0, 1))
+
+
+def _separation(problem: Problem, option: _Option, a: Fit, b: Fit) -> float:
+    """Expected evidence, nats, for ``a`` against ``b`` refitted, and the other way round; the smaller."""
+    group = option.group
+    try:
+        preds = [predict(x.model, group, problem.sampling) for x in (a, b)]
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return 0.0
+    here = replace(problem, groups=(group,))
+    falls = []
+    for fit, own, other in ((a, *preds), (b, *preds[::-1])):
+        weights = make_weights(here, [own], 0.0)
+        change = group.observe(other.U - own.U)
+        H, moment = jacobian(here, fit.model, group, own).normal(weights.whiten[0], change)
+        known = fit.information + H
+        size = np.sqrt(np.maximum(np.diag(known), 1e-30))
+        step = np.linalg.pinv(known / np.outer(size, size), rcond=1e-12, hermitian=True) @ (moment / size)
+        left = np.sum(np.abs(weights.apply(0, change)) ** 2) - (moment / size) @ step
+        falls.append(0.5 * float(left))
+    return min(falls) if np.all(np.isfinite(falls)) else 0.0
+
+
+def _plan(problem: Problem, option: _Option) -> Plan:
+    """Multisines at the operating point: the level in question, and smaller ones to compare with."""
+    group, structure = option.group, problem.structure
+    par = Parameters.nominal(structure.robot)
+    lin = linearise(structure, equilibrium(structure, par, group.posture))
+    rate = 1.0 / problem.sampling.sample_time
+    band = group.omega[[1, group.n_compared - 1]] / 2 / np.pi
+    return make_plan(
+        structure.robot,
+        points=1,
+        validation_points=0,
+        levels=tuple(float(share * group.amplitude.max()) for share in LEVELS),
+        sample_rate=rate,
+        period=problem.samples(group),
+        periods=PERIODS,
+        band_hz=(float(band[0]), float(min(band[1], 0.45 * rate))),
+        postures=group.posture[None],
+        inertia=par.inertia + np.diag(lin.M)[structure.driven],
+        gravity_torque=np.abs(lin.g[structure.driven]),
+        trajectory=False,
+    )

@@ -1,0 +1,81 @@
+"""The experiment that separates two hypotheses: closed cases, and one round trip to a plan."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ident.attribute import Candidate
+from ident.excitation import plan_from_toml, plan_to_toml
+from ident.extended import Effect, Model
+from ident.hypotheses import catalogue
+from ident.next_experiment import _Option, _separation, moved, separating_experiment, thinned
+from ident.torque_fit import fit
+
+
+@pytest.fixture(scope="module")
+def fitted(clean):
+    """Problem, and the baseline, a hardening gear and Coulomb friction at the elbow, each as it stands."""
+    from ident.diagnose import identify
+
+    setup, baseline = identify(clean[0])
+    named = {h.key: h for h in catalogue(setup.problem.structure)}
+
+    def with_effect(effect, *p):
+        h = named[effect, "elbow_joint"]
+        model = Model(setup.problem.structure, baseline.model.par, (Effect(h, np.array(p, float)),))
+        return h, fit(setup.problem, model, base_names=setup.names, iterations=0, remainders=baseline.remainders)
+
+    return setup.problem, baseline, with_effect("hardening_stiffness", 1e9), with_effect("coulomb_friction", 0.2, 0.0, 1e-3)
+
+
+def option(problem, factor, shift=0.0):
+    group = next(g for g in problem.groups if g.window is None)
+    return _Option(moved(thinned(group, np.arange(2)), factor, 2, shift), factor, 2, shift)
+
+
+def test_a_model_is_not_separated_from_itself(fitted):
+    problem, baseline, (_, hard), _ = fitted
+    for result in (baseline, hard):
+        assert _separation(problem, option(problem, 2.0), result, result) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_what_the_drives_can_take_up_does_not_separate(fitted):
+    """A stiffness that differs by 1 % is a parameter of both models: only where it is known already does it tell."""
+    problem, baseline, _, _ = fitted
+    par = baseline.model.par
+    stiffer = replace(baseline, model=replace(baseline.model, par=replace(par, stiffness=1.01 * par.stiffness)))
+
+    def separation(known):
+        return _separation(problem, option(problem, 1.0), *(replace(x, information=known * x.information) for x in (stiffer, baseline)))
+
+    assert 0 < separation(1e-6) < 0.05 * separation(1e6)
+
+
+def test_a_cubic_spring_shows_more_the_larger_the_motion(fitted):
+    problem, baseline, (_, hard), _ = fitted
+    small, large = (_separation(problem, option(problem, f), baseline, hard) for f in (0.5, 2.0))
+    # Under gravity the cube is first of all a stiffness of its own in every posture: its torque goes with the
+    # motion, and the evidence with the square of that.
+    assert 0 < 8 * small < large
+
+
+def test_the_plan_is_one_that_the_arm_can_run(fitted, tmp_path):
+    problem, baseline, (gear, hard), (rub, friction) = fitted
+    candidates = (Candidate(gear, hard, 0.0, 0.55), Candidate(rub, friction, -0.2, 0.45))
+    result = SimpleNamespace(rounds=(SimpleNamespace(candidates=candidates),), baseline=baseline)
+    found = separating_experiment(problem, result)
+    assert "hardening_stiffness at elbow_joint" in found.text and "coulomb_friction at elbow_joint" in found.text
+    assert found.nats > 5
+    plan_to_toml(found.plan, tmp_path / "next_plan.toml")
+    again, robot = plan_from_toml(tmp_path / "next_plan.toml"), problem.structure.robot
+    assert {e.operating_point for e in again.experiments} == {"op01"} and len({e.amplitude for e in again.experiments}) == 3
+    q0 = again.experiments[0].q0
+    assert np.all(q0 > robot.q_min) and np.all(q0 < robot.q_max)
+
+
+def test_a_sure_cause_asks_for_nothing(fitted):
+    problem, _, (gear, hard), (rub, friction) = fitted
+    candidates = (Candidate(gear, hard, 0.0, 0.95), Candidate(rub, friction, -3.0, 0.05))
+    assert separating_experiment(problem, SimpleNamespace(rounds=(SimpleNamespace(candidates=candidates),))) is None
