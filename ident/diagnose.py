@@ -339,9 +339,12 @@ def collapsed(problem: Problem, final: Fit) -> bool:
     Stiffness or motor inertia far from the starting guesses then stand for what is missing, and so may
     the causes that were found beside them.
     """
-    par, nominal = final.model.par, problem.nominal
-    ratio = np.concatenate([par.stiffness / nominal.stiffness, par.inertia / nominal.inertia])
-    return final.chi2_per_dof > LEFT_ERROR and bool(np.any(np.abs(np.log(ratio)) > np.log(IMPLAUSIBLE)))
+    n, x = problem.structure.n, final.model.par.to_log() - problem.nominal.to_log()
+    drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
+    known = np.sqrt(np.maximum(np.diag(final.covariance())[drives], 0.0)) < UNDETERMINED
+    limit = np.log(IMPLAUSIBLE)
+    # A gear stiffer than the data can see ends anywhere above.
+    return final.chi2_per_dof > LEFT_ERROR and bool(np.any((x[drives] < -limit) | (known & (x[drives] > limit))))
 
 
 def known_probability(left: float, refuted: bool) -> float:
@@ -362,6 +365,8 @@ def _cause(
         if c not in same and c.probability > 1e-3:
             name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
             others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
+    if h.options.get("trivial", lambda p: False)(effect.p):
+        trust *= known_probability(1.0, True)
     parameters = reported_parameters(effect, final, covariance)
     numbers = {k: v.value for k, v in parameters.items()}
     return Cause(
