@@ -144,14 +144,18 @@ def attribute(
     hypotheses: Sequence[Hypothesis] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Attribution:
-    """Find the causes of what the baseline does not explain."""
+    """Find the causes of what the baseline does not explain.
+
+    Args:
+        max_causes: rounds at most; an effect found at several joints at once is one of them.
+    """
     p_value = discrepancy_p_value(baseline)
     detected = p_value < DETECTION_LEVEL and baseline.chi2_per_dof > DETECTION_EXCESS
     hypotheses = tuple(hypotheses if hypotheses is not None else catalogue(problem.structure))
-    current, rounds, unknown = baseline, [], False
-    while detected and len(rounds) < max_causes and current.chi2_per_dof > DETECTION_EXCESS:
+    current, rounds, unknown, count = baseline, [], False, 0
+    while detected and count < max_causes and current.chi2_per_dof > DETECTION_EXCESS:
         if progress is not None:
-            progress(f"cause {len(rounds) + 1}: screening {len(hypotheses)} hypotheses")
+            progress(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
         found = attribute_once(problem, current, hypotheses, progress=progress)
         if not found.candidates:
             break
@@ -164,10 +168,58 @@ def attribute(
             rounds.append(found)
             break
         rounds.append(found)
+        count += 1
         current = polish(problem, best.fit)
+        if current.chi2_per_dof > FAINT:
+            current, more = companions(problem, current, best, hypotheses)
+            rounds += more
         taken = {e.hypothesis.key for e in current.model.effects}
         hypotheses = tuple(h for h in hypotheses if h.key not in taken)
     return Attribution(baseline, detected, p_value, tuple(rounds), current, unknown)
+
+
+def companions(
+    problem: Problem, current: Fit, winner: Candidate, hypotheses: Sequence[Hypothesis]
+) -> tuple[Fit, list[Round]]:
+    """The effect just named at other joints too, where at least two of them ask for it: friction of a real arm.
+
+    Each must explain ``MIN_SHARE`` of what is left at its own joint, and all are fitted together. A single
+    one is left to the next round, where it competes.
+
+    Returns:
+        The model with them, and a round for each; ``current`` and none where there are none.
+    """
+    effect = winner.hypothesis.effect
+    same = [h for h in hypotheses if h.effect == effect and h.joint >= 0 and h.key != winner.hypothesis.key]
+    preds = predictions(problem, current.model, current.remainders)
+    noise = current.count / problem.structure.n
+    left = np.maximum(joint_costs(problem, preds, current.weights) - noise, 1.0)
+    scores = [
+        s
+        for s in screen(problem, current, preds, same)
+        if s.start is not None and s.gain > MIN_SHARE * left[s.hypothesis.joint]
+    ]
+    if len(scores) < 2:
+        return current, []
+    model = current.model
+    for score in scores:
+        model = replace(model, effects=extended_by(model.effects, score))
+    found = refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
+    if found is None:
+        return current, []
+    after = joint_costs(problem, predictions(problem, found.model, found.remainders), current.weights) - noise
+    kept = [s for s in scores if after[s.hypothesis.joint] < (1.0 - MIN_SHARE) * left[s.hypothesis.joint]]
+    if len(kept) < 2:
+        return current, []
+    keys = {s.hypothesis.key for s in kept} | {e.hypothesis.key for e in current.model.effects}
+    effects = tuple(e for e in found.model.effects if e.hypothesis.key in keys)
+    last = polish(problem, replace(found, model=replace(found.model, effects=effects)))
+    scale = max(1.0, last.cost / last.count)
+    joined = reweighted(problem, last, current.weights)
+    rounds = [
+        Round(current, (Candidate(s.hypothesis, joined, 0.0, winner.probability),), (s,), scale) for s in kept
+    ]
+    return last, rounds
 
 
 def explained(problem: Problem, before: Fit, after: Fit) -> float:

@@ -36,6 +36,7 @@ from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Valu
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
 MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
+LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
 WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it
@@ -111,9 +112,11 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
         if given is not None and np.all(given > 0):
             out.append(np.asarray(given, float))
         else:
-            each = np.stack([difference_noise(getattr(s, channel)) for s in dataset.segments])
+            signals = [getattr(s, channel) for s in dataset.segments]
+            each = np.median([difference_noise(x) for x in signals], axis=0)
+            size = np.median([np.std(x, axis=0) for x in signals], axis=0)
             floor = 1e-9 if channel == "q" else 1e-6
-            out.append(np.maximum(np.median(each, axis=0), floor))
+            out.append(np.maximum(each, np.maximum(LEAST_NOISE[channel] * size, floor)))
     return out[0], out[1]
 
 

@@ -28,6 +28,7 @@ from ident.records import NOISE_LINES, POINTS_PER_LINE, Group, mean_over_lines
 
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of periodic data, at least
+LOOP_MOST = 6  # the same, at most: modes far above the signals follow at once
 LOOP_STEP = 0.25  # its step, at most, over the time scale of the fastest mode
 
 
@@ -252,7 +253,8 @@ def _modes(
     D = np.diag(damping_diagonal(structure, par))
     K = np.diag(stiffness_diagonal(structure, par)) + plane.lin.Kg
     fastest = np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(plane.lin.M, K))).max())
-    points = max(LOOP_REFINEMENT * POINTS_PER_LINE * len(group.omega), int(group.period_time * fastest / LOOP_STEP))
+    least = LOOP_REFINEMENT * POINTS_PER_LINE * len(group.omega)
+    points = int(np.clip(group.period_time * fastest / LOOP_STEP, least, LOOP_MOST * least))
     grid = replace(group, n_time=scipy.fft.next_fast_len(points, real=True))
     return grid, kernels.modal_compliance(plane.lin.M, D, K, int(column), group.period_time / grid.n_time)
 

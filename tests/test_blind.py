@@ -65,3 +65,18 @@ def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path):
     assert verdict.unexplained_verdict == "unknown cause remains"
     assert all(c.probability <= 0.5 for c in verdict.causes)
     assert "elbow_joint" in verdict.residual_description
+
+
+def test_friction_of_every_joint_counts_once(ur10, tmp_path):
+    """A real arm rubs everywhere: with one round the same effect is found at all joints that have it."""
+    from sim import parse_effect
+
+    truth = {"shoulder_pan_joint": 4.0, "elbow_joint": 3.0, "wrist_1_joint": 1.5, "wrist_2_joint": 1.2}
+    hidden = [parse_effect(f"coulomb_friction@{j}:torque={t}", ur10) for j, t in truth.items()]
+    data = run_experiment(small_plan(ur10, 6), hidden, seed=6, drives=draw_drives(np.random.default_rng(6), ur10))
+    verdict = diagnose(through_files(data, tmp_path), max_causes=1)
+    found = {c.joint: c for c in verdict.causes if c.probability > 0.5}
+    assert set(found) == set(truth) and all(c.effect == "coulomb_friction" for c in found.values())
+    for joint, torque in truth.items():
+        assert found[joint].parameters["torque"].value == pytest.approx(torque, rel=0.15)
+    assert verdict.gain.gap_closed > 0.9
