@@ -40,6 +40,8 @@ LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of 
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
 WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it
+CLEAR = 2.0  # held-out error of the baseline over the noise from which it tells
+CLOSED = 0.5  # share of the gap that the extended model must then close
 LEFT_ERROR = 3.0  # the same above which an unknown cause remains however strong the named ones are
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
@@ -332,8 +334,14 @@ def explained_share(found: Round, final: Fit) -> float:
 
 
 def fails_held_out(gain: Gain | None) -> bool:
-    """Whether the extended model predicts held-out data worse than the baseline: no name is trusted then."""
-    return gain is not None and gain.after > WORSE * gain.before
+    """Whether held-out data refute the extended model: no name is trusted then.
+
+    It predicts them worse than the baseline, or leaves most of a clear error that the causes were named for.
+    """
+    if gain is None:
+        return False
+    clear = gain.before > CLEAR * gain.noise_floor and gain.gap_closed is not None
+    return gain.after > WORSE * gain.before or (clear and gain.gap_closed < CLOSED)
 
 
 def collapsed(problem: Problem, final: Fit) -> bool:

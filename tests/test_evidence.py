@@ -98,3 +98,15 @@ def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):
         off = np.abs(view.extended - view.measured) / view.measured_std
         assert np.median(off) < 2.0 and np.array_equal(view.baseline, view.extended)
         assert np.all(np.abs(view.extended - view.measured) < 0.2 * np.abs(view.measured).max())
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "noise", "refuted"),
+    [(10.0, 1.2, 1.0, False), (10.0, 9.0, 1.0, True), (10.0, 11.0, 9.9, True), (1.3, 1.2, 1.0, False)],
+)
+def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise, refuted):
+    from ident.diagnose import fails_held_out
+    from ident.verdict import Gain
+
+    closed = (before - after) / (before - noise)
+    assert fails_held_out(Gain(("a",), "RMS", before, after, noise, closed, (closed, closed), "validation segments")) is refuted
