@@ -16,7 +16,6 @@ import numpy as np
 import scipy.stats
 
 from ident.extended import Effect, Model
-from ident.graybox import parameter_names
 from ident.hypotheses import Hypothesis, Parameter, catalogue
 from ident.parallel import map_threads
 from ident.screening import Score, screen, signal_scale
@@ -37,13 +36,13 @@ DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
-FAINT = 3.0  # chi2 per degree of freedom up to which no strong effects are tried beyond the screened ones
+FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched by linear steps alone
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
-ANSWERED = 0.2  # share of the excess that the best may leave where no strong effects are tried beyond the screened ones
+ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 HOPEFUL = 5  # candidates fitted further after the first steps
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
@@ -60,6 +59,7 @@ DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
 WORTH_A_REFIT = 0.05  # the same for a screened gain: linear steps understate strong effects
+WORTH_A_REFIT_FAINT = 0.1  # the same where what is left is faint
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,8 @@ def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None
     Where the fit leaves more than the noise it is started again with other dampers: they are
     determined far worse than springs, and a damper that has once collapsed does not come back.
     """
-    names = parameter_names(problem.structure.robot)
     start = Model(problem.structure, problem.nominal)
-    best = first = anneal(problem, start, base_names=names, progress=progress)
+    best = first = anneal(problem, start, progress=progress)
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
@@ -120,7 +119,6 @@ def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None
             other = anneal(
                 problem,
                 again,
-                base_names=names,
                 ladder=ANNEALING[-2:],
                 iterations=8,
                 remainders=best.remainders,
@@ -191,6 +189,8 @@ def companions(
     """
     effect = winner.hypothesis.effect
     same = [h for h in hypotheses if h.effect == effect and h.joint >= 0 and h.key != winner.hypothesis.key]
+    if len(same) < 2:
+        return current, []
     preds = predictions(problem, current.model, current.remainders)
     noise = current.count / problem.structure.n
     left = np.maximum(joint_costs(problem, preds, current.weights) - noise, 1.0)
@@ -257,11 +257,9 @@ def revived(problem: Problem, model: Model) -> Model:
 
 def polish(problem: Problem, result: Fit) -> Fit:
     """The winner fitted to the end, under the noise that it sees itself."""
-    names = parameter_names(problem.structure.robot)
     return fit(
         problem,
         revived(problem, result.model),
-        base_names=names,
         iterations=POLISH_STEPS,
         remainders=result.remainders,
     )
@@ -277,7 +275,7 @@ def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
     stages, ladder = current.softer, ANNEALING[:-1]
     if not stages:
         start = replace(current.model, par=problem.nominal)
-        last = anneal(problem, start, base_names=parameter_names(problem.structure.robot), ladder=ladder)
+        last = anneal(problem, start, ladder=ladder)
         stages = (*last.softer, last)
     kept = 1
     while kept < len(stages) and stages[kept].chi2_per_dof <= STRONG:
@@ -397,7 +395,7 @@ def explore(
     preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
-    worth = WORTH_A_REFIT * (1.0 if stage.chi2_per_dof > FAINT else 2.0)
+    worth = WORTH_A_REFIT if stage.chi2_per_dof > FAINT else WORTH_A_REFIT_FAINT
     if not scores or not (regardless or scores[0].gain > worth * excess):
         return [], scores
 
@@ -436,12 +434,10 @@ def refit(
     problem: Problem, model: Model, weights: Weights, remainders: Sequence[np.ndarray], iterations: int = 10
 ) -> Fit | None:
     """A candidate fitted from where screening put it; None where its model cannot be computed."""
-    names = parameter_names(problem.structure.robot)
     try:
         return fit(
             problem,
             revived(problem, model),
-            base_names=names,
             iterations=iterations,
             weights=weights,
             remainders=remainders,
@@ -483,9 +479,8 @@ def beside_strong(
         if progress is not None:
             progress(f"strong: {h.effect} at {h.place}")
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
-        names = parameter_names(problem.structure.robot)
         try:
-            return h, anneal(problem, start, base_names=names, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
+            return h, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
         except NOT_COMPUTED:
             return h, None
 
@@ -507,10 +502,11 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
     """
     preds = predictions(problem, stage.model, stage.remainders)
     loudest = int(np.argmax(joint_costs(problem, preds, stage.weights)))
+    scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} if j >= 0}
     return [
-        replace(s, start=s.hypothesis.options["size"](signal_scale(problem, preds, s.hypothesis.joint, ())))
+        replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))
         for s in scores
-        if s.hypothesis.joint in {loudest, likely} and "size" in s.hypothesis.options
+        if s.hypothesis.joint in scales and "size" in s.hypothesis.options
     ]
 
 

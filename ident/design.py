@@ -25,7 +25,7 @@ import scipy.optimize
 from ident.candidates import Candidates, draw_candidates
 from ident.excitation import Plan, make_plan
 from ident.graybox import Parameters, Structure, build_structure, parameter_names
-from ident.information import conditions, information, linearised
+from ident.information import conditions, information, linearised, motor_loads
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 
@@ -163,8 +163,7 @@ def design_plan(design: Design, *, levels: tuple[float, ...] = (1.0,), validatio
     held_out = rng.choice(others, min(validation_points, len(others)), replace=False)
     postures = np.concatenate([design.postures, design.candidates.q[held_out]])
     structure = design.structure
-    par, driven = Parameters.nominal(structure.robot), structure.driven
-    lins = linearised(structure, par, postures)
+    par = Parameters.nominal(structure.robot)
     return make_plan(
         structure.robot,
         points=len(design.chosen),
@@ -172,8 +171,7 @@ def design_plan(design: Design, *, levels: tuple[float, ...] = (1.0,), validatio
         levels=levels,
         seed=design.seed,
         postures=postures,
-        inertia=par.inertia + np.min([np.diag(lin.M)[driven] for lin in lins], axis=0),
-        gravity_torque=np.max([np.abs(lin.g[driven]) for lin in lins], axis=0),
+        **motor_loads(structure, par, linearised(structure, par, postures)),
         **design.grid,
     )
 

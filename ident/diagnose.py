@@ -18,13 +18,12 @@ from ident.graybox import (
     build_structure,
     equilibrium,
     linearise,
-    parameter_names,
     parameter_unit,
     stiffness_diagonal,
 )
 from ident.inverse import Sampling
 from ident.link_sensor import LinkDelay, find_link_delays
-from ident.next_experiment import NextExperiment, separating_experiment
+from ident.next_experiment import NextExperiment, advice, separating_experiment
 from ident.noise import sample_noise
 from ident.parallel import map_threads, one_thread_each
 from ident.quantization import Steps, find_steps
@@ -54,7 +53,6 @@ class Setup:
 
     problem: Problem
     held_out: tuple[Group, ...]
-    names: tuple[str, ...]
     steps: tuple[Steps, ...] = ()
 
 
@@ -86,7 +84,7 @@ def set_up(dataset: Dataset) -> Setup:
         q_std,
         step_std=step_std,
     )
-    return Setup(problem, held_out, parameter_names(robot), steps)
+    return Setup(problem, held_out, steps)
 
 
 def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) -> float:
@@ -221,7 +219,7 @@ def leave_one_out(setup: Setup, result: Attribution, affected: Sequence[int]) ->
         for start in (result.baseline, result.final):
             remainders = [W for k, W in enumerate(start.remainders) if k != i]
             models.append(
-                fit(part, start.model, base_names=setup.names, iterations=4, remainders=remainders).model
+                fit(part, start.model, iterations=4, remainders=remainders).model
             )
         return segment_errors(problem, problem.groups[i : i + 1], *models)[0]
 
@@ -290,7 +288,7 @@ def make_verdict(
         unexplained_share=float(left),
         unexplained_verdict=verdict,
         gain=gain,
-        next_experiment=separating.text if separating else next_experiment(causes, unknown),
+        next_experiment=separating.text if separating else advice(causes, unknown),
         sentence=sentence(causes, unknown, detected, gain),
         unidentified=undetermined,
         residual_description=description,
@@ -433,29 +431,3 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
     closed = "" if gain is None or gain.gap_closed is None or not of_torque else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
     rest = ", and an unknown cause remains" if unknown else ""
     return f"The simulation misses {names}{closed}{rest}."
-
-
-ADVICE = {
-    frozenset({"coulomb_friction", "stribeck_friction"}): "a slow sweep at constant speed in both directions",
-    frozenset({"coulomb_friction", "presliding_friction"}): "the same excitation at a quarter of the amplitude",
-    frozenset({"backlash", "softening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
-    frozenset({"backlash", "hardening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
-    frozenset({"torque_delay", "torque_lag"}): "a band up to a third of the sample rate",
-    frozenset({"sensor_delay", "sensor_lag"}): "a band up to a third of the sample rate",
-    frozenset({"cogging", "transmission_error"}): "the same posture with excitation near the resonance, over a whole period of the ripple",
-    frozenset({"payload", "link_inertia"}): "static torques in postures that turn the last link against gravity",
-}
-
-
-def next_experiment(causes: Sequence[Cause], unknown: bool) -> str | None:
-    """What to measure to separate the alternatives, or to see an unknown cause better."""
-    for cause in causes:
-        if cause.probability < 0.9 and cause.alternatives:
-            other = cause.alternatives[0]
-            advice = ADVICE.get(frozenset({cause.effect, other.effect}), "two more postures and a second level of amplitude")
-            return f"To tell {cause.effect} from {other.effect} at {cause.joint}: {advice}."
-    if unknown:
-        return "Two more levels of amplitude and two more postures, to see how the unknown cause scales with motion and load."
-    return None
-
-

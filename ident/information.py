@@ -18,7 +18,7 @@ band, and nonlinear distortion, which nobody knows beforehand.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,12 +61,11 @@ def conditions(
 
     One amplitude for all, as in a plan: set by the least inertia and the largest gravity torque.
     """
-    robot, driven = structure.robot, structure.driven
-    inertia = par.inertia + np.min([np.diag(lin.M)[driven] for lin in lins], axis=0)
-    gravity = np.max([np.abs(lin.g[driven]) for lin in lins], axis=0)
+    robot, loads = structure.robot, motor_loads(structure, par, lins)
+    room = headroom(structure, loads["gravity_torque"])
     return Conditions(
         excitation.frequency,
-        shape_amplitudes(robot, excitation.frequency, inertia, "torque", headroom(structure, gravity)),
+        shape_amplitudes(robot, excitation.frequency, loads["inertia"], "torque", room),
         excitation.period * (excitation.periods - excitation.transient_periods) * realizations,
         robot.array("q_std"),
         robot.array("tau_std"),
@@ -82,6 +81,15 @@ def headroom(structure: Structure, gravity: np.ndarray) -> np.ndarray:
 def linearised(structure: Structure, par: Parameters, postures: np.ndarray) -> list[Linearisation]:
     """Linearisation at the equilibrium of every motor posture (Q, n)."""
     return [linearise(structure, equilibrium(structure, par, q)) for q in postures]
+
+
+def motor_loads(structure: Structure, par: Parameters, lins: Sequence[Linearisation]) -> dict[str, np.ndarray]:
+    """Least ``inertia`` that each motor moves, kg m2, and largest ``gravity_torque``, N m, for ``make_plan``; (n,)."""
+    driven = structure.driven
+    return {
+        "inertia": par.inertia + np.min([np.diag(lin.M)[driven] for lin in lins], axis=0),
+        "gravity_torque": np.max([np.abs(lin.g[driven]) for lin in lins], axis=0),
+    }
 
 
 def information(

@@ -18,9 +18,11 @@ from ident.attribute import Attribution, Candidate
 from ident.excitation import Plan, make_plan
 from ident.extended import predict
 from ident.graybox import Parameters, equilibrium, linearise
+from ident.information import motor_loads
 from ident.parallel import map_threads
 from ident.records import Group
 from ident.torque_fit import Fit, Problem, jacobian, make_weights
+from ident.verdict import Cause
 from robot_assets.robot import linear_joints
 
 TIED = 0.1  # probability from which a second hypothesis is worth an experiment
@@ -31,7 +33,18 @@ RECORDS = 6  # of a posture that are looked at
 TORQUE_SHARE = 0.9  # of the torque limit that a planned motion may take
 LEVELS = (1.0, 0.5, 0.25)  # of a planned experiment, in units of the largest
 MANY = 1000.0  # nats above which their number says no more: it is of first order
-PERIODS = 3  # of a planned multisine, the first a transient
+
+
+ADVICE = {
+    frozenset({"coulomb_friction", "stribeck_friction"}): "a slow sweep at constant speed in both directions",
+    frozenset({"coulomb_friction", "presliding_friction"}): "the same excitation at a quarter of the amplitude",
+    frozenset({"backlash", "softening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
+    frozenset({"backlash", "hardening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
+    frozenset({"torque_delay", "torque_lag"}): "a band up to a third of the sample rate",
+    frozenset({"sensor_delay", "sensor_lag"}): "a band up to a third of the sample rate",
+    frozenset({"cogging", "transmission_error"}): "the same posture with excitation near the resonance, over a whole period of the ripple",
+    frozenset({"payload", "link_inertia"}): "static torques in postures that turn the last link against gravity",
+}
 
 
 @dataclass(frozen=True)
@@ -175,10 +188,20 @@ def _plan(problem: Problem, option: _Option) -> Plan:
         levels=tuple(float(share * group.amplitude.max()) for share in LEVELS),
         sample_rate=rate,
         period=problem.samples(group),
-        periods=PERIODS,
         band_hz=(float(band[0]), float(min(band[1], 0.45 * rate))),
         postures=group.posture[None],
-        inertia=par.inertia + np.diag(lin.M)[structure.driven],
-        gravity_torque=np.abs(lin.g[structure.driven]),
         trajectory=False,
+        **motor_loads(structure, par, [lin]),
     )
+
+
+def advice(causes: Sequence[Cause], unknown: bool) -> str | None:
+    """What to measure where no experiment was computed: by the names of the causes alone."""
+    for cause in causes:
+        if cause.probability < 0.9 and cause.alternatives:
+            other = cause.alternatives[0]
+            what = ADVICE.get(frozenset({cause.effect, other.effect}), "two more postures and a second level of amplitude")
+            return f"To tell {cause.effect} from {other.effect} at {cause.joint}: {what}."
+    if unknown:
+        return "Two more levels of amplitude and two more postures, to see how the unknown cause scales with motion and load."
+    return None

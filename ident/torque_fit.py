@@ -15,8 +15,8 @@ import numpy as np
 
 from ident.columns import Columns
 from ident.extended import Effect, Model, Prediction, predict, predict_at
-from ident.graybox import Parameters, Structure
-from ident.inverse import Sampling, baseline_products
+from ident.graybox import Parameters, Structure, parameter_names
+from ident.inverse import Motion, Sampling, baseline_products
 from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
 from ident.records import Group
@@ -160,9 +160,9 @@ def data_count(problem: Problem) -> int:
     return total
 
 
-def coordinate_names(model: Model, structure_names: Sequence[str]) -> tuple[str, ...]:
+def coordinate_names(model: Model) -> tuple[str, ...]:
     """Names of the fitted coordinates: baseline, timing, effects."""
-    names = [*structure_names, "timing"]
+    names = [*parameter_names(model.structure.robot), "timing"]
     for effect in model.effects:
         h = effect.hypothesis
         names += [f"{h.effect}@{h.place}:{p.name}" for p in h.parameters]
@@ -248,13 +248,19 @@ def _through_drives(columns: Columns, model: Model, group: Group, pred: Predicti
         return columns
     dense = columns.dense()
     for effect in drives:
-        h, j, motion = effect.hypothesis, effect.hypothesis.joint, pred.motion(group)
+        j, motion = effect.hypothesis.joint, pred.motion(group)
         full = np.zeros((dense.shape[-1], *pred.U.shape[:2]), complex)
         full[:, :, : dense.shape[1]] = np.moveaxis(dense[:, :, j], -1, 0)
-        passed = h.law(effect.p, motion, j, 0.0, full) - h.law(effect.p, motion, j, 0.0, 0 * full[0])
+        passed = _change_passed(effect, motion, full)
         dense[:, :, j] = np.moveaxis(passed[:, :, : dense.shape[1]], 0, -1)
     none = np.empty(0, int)
     return Columns(columns.products.pick(none), none, dense, np.arange(dense.shape[-1]))
+
+
+def _change_passed(drive: Effect, motion: Motion, X: np.ndarray) -> np.ndarray:
+    """A change (..., S, L) of the torque before a drive with an effect, as it is after it."""
+    h, k = drive.hypothesis, motion.par.stiffness[drive.hypothesis.joint]
+    return h.law(drive.p, motion, h.joint, k, X) - h.law(drive.p, motion, h.joint, k, 0 * X)
 
 
 def compared_lines(group: Group) -> int:
@@ -302,8 +308,7 @@ def _motor_columns(
     for p, step in steps:
         X = pred.plane.record * motion.lines(h.law(p, motion, j, k) - now)
         for drive in drives:
-            law = drive.hypothesis.law
-            X = law(drive.p, motion, j, k, X) - law(drive.p, motion, j, k, 0 * X)
+            X = _change_passed(drive, motion, X)
         out = np.zeros_like(pred.U)
         out[..., j] = X / step
         columns.append(out)
@@ -314,7 +319,6 @@ def anneal(
     problem: Problem,
     model: Model,
     *,
-    base_names: Sequence[str],
     ladder: Sequence[float] = ANNEALING,
     iterations: int = 12,
     remainders: Sequence[np.ndarray] | None = None,
@@ -327,7 +331,6 @@ def anneal(
             fit(
                 problem,
                 stages[-1].model if stages else model,
-                base_names=base_names,
                 rho=rho,
                 iterations=iterations,
                 remainders=stages[-1].remainders if stages else remainders,
@@ -341,7 +344,6 @@ def fit(
     problem: Problem,
     model: Model,
     *,
-    base_names: Sequence[str],
     rho: float = 0.0,
     iterations: int = 12,
     weights: Weights | None = None,
@@ -352,7 +354,6 @@ def fit(
 
     Args:
         model: start.
-        base_names: names of the baseline coordinates.
         rho: relative error added to the noise.
         iterations: at most.
         weights: those to fit under; of the start where None.
@@ -406,9 +407,7 @@ def fit(
         damping = max(damping / 10, 1e-9)
         preds, cost = new, new_cost
         if np.max(np.where(moves, drift, 0.0)) > STALE:
-            preds = predictions(problem, model, Ws, steps=1)
-            Ws = [p.solution.W for p in preds]
-            cost = weighted_cost(problem, preds, weights)
+            preds, Ws, cost = _renewed(problem, model, Ws, weights)
             drift[:] = 0.0
         if progress is not None:
             progress(f"fit: chi2/dof {cost / count:.3g}")
@@ -416,11 +415,17 @@ def fit(
             converged = True
             break
     if np.any(drift):
-        preds = predictions(problem, model, Ws, steps=1)
-        Ws = [p.solution.W for p in preds]
-        cost = weighted_cost(problem, preds, weights)
+        preds, Ws, cost = _renewed(problem, model, Ws, weights)
     H, _ = _normal(problem, model, preds, weights)
-    return Fit(model, cost, count, H, coordinate_names(model, base_names), tuple(Ws), weights, converged)
+    return Fit(model, cost, count, H, coordinate_names(model), tuple(Ws), weights, converged)
+
+
+def _renewed(
+    problem: Problem, model: Model, remainders: Sequence[np.ndarray], weights: Weights
+) -> tuple[list[Prediction], list[np.ndarray], float]:
+    """Predictions, geometric remainders and cost after a step of the remainders towards the model's own."""
+    preds = predictions(problem, model, remainders, steps=1)
+    return preds, [p.solution.W for p in preds], weighted_cost(problem, preds, weights)
 
 
 def _moves_links(model: Model) -> np.ndarray:

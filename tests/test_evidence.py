@@ -1,5 +1,6 @@
 """How candidates are weighed and scored: closed forms of the evidence, and one sum by two ways."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -110,3 +111,32 @@ def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise,
 
     closed = (before - after) / (before - noise)
     assert fails_held_out(Gain(("a",), "RMS", before, after, noise, closed, (closed, closed), "validation segments")) is refuted
+
+
+def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
+    from ident.diagnose import collapsed
+
+    _, setup, baseline = identified
+    bad = replace(baseline, cost=10.0 * baseline.cost)
+    moved = baseline.model.par.stiffness * np.array([1, 1, 0.1, 1, 1, 1])
+    spoilt = replace(bad, model=replace(bad.model, par=replace(bad.model.par, stiffness=moved)))
+    stiff = replace(bad, model=replace(bad.model, par=replace(bad.model.par, stiffness=100.0 * baseline.model.par.stiffness)))
+    unseen = replace(stiff, information=1e-12 * stiff.information)
+    assert not collapsed(setup.problem, bad)
+    assert collapsed(setup.problem, spoilt) and collapsed(setup.problem, stiff)
+    assert not collapsed(setup.problem, replace(spoilt, cost=baseline.cost))
+    assert not collapsed(setup.problem, unseen)
+
+
+def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
+    from ident.diagnose import LEAST_NOISE, _noise
+
+    data = clean[0]
+    t = np.arange(len(data.segments[0].t))[:, None] / data.sample_rate
+    smooth = np.sin(2 * np.pi * (0.3 + 0.1 * np.arange(6)) * t)
+    segment = replace(data.segments[0], q=smooth, tau=50.0 * smooth)
+    _, tau_std = _noise(replace(data, segments=(segment,), q_std=None, tau_std=None))
+    assert np.allclose(tau_std, LEAST_NOISE["tau"] * segment.tau.std(axis=0))
+    rough = np.random.default_rng(0).normal(size=smooth.shape)
+    noisy = replace(segment, tau=segment.tau + rough)
+    assert _noise(replace(data, segments=(noisy,), q_std=None, tau_std=None))[1] == pytest.approx(1.0, rel=0.1)

@@ -1,14 +1,21 @@
 """Identification of drives that are off by up to a factor of two, from files."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ident.attribute import discrepancy_p_value
-from ident.diagnose import diagnose, identify
+from ident.diagnose import diagnose, identify, set_up
 from ident.estimate import ESTIMATORS, fit_frf
-from ident.extended import predict
+from ident.extended import Effect, Model, predict
 from ident.frf import estimate_frf
+from ident.gain import segment_errors
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
+from ident.hypotheses import catalogue
+from sim import parse_effect, run_experiment
+from sim.experiment import draw_drives
+from tests.conftest import small_plan
 
 FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
@@ -83,3 +90,20 @@ def test_the_five_averages_agree_on_quiet_data(clean, estimator):
     other = estimate_frf(clean[0], estimator=estimator)
     scale = np.abs(reference.G).max(axis=(2, 3), keepdims=True)
     assert np.median(np.abs(other.G - reference.G) / scale) < 0.01
+
+
+def test_a_ripple_that_is_fast_along_a_motion_does_not_fold_into_its_band(ur10):
+    """The ripple passes at up to 40 Hz where the motion is compared below 3 Hz."""
+    drives = draw_drives(np.random.default_rng(4), ur10)
+    plan = small_plan(ur10, 4, points=1, levels=(1.0,), validation_points=0, trajectory=True)
+    data = run_experiment(plan, [parse_effect("cogging@elbow_joint:amplitude=4,periods_per_rev=606,phase=0.7", ur10)], seed=4, drives=drives)
+    setup = set_up(data)
+    figures = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
+    par = replace(setup.problem.nominal, **{k: drives[v] for k, v in figures.items()})
+    bare = Model(setup.problem.structure, par)
+    (h,) = (h for h in catalogue(setup.problem.structure) if h.key == ("cogging", "elbow_joint"))
+    values = {"sine": 4 * np.cos(0.7), "cosine": 4 * np.sin(0.7), "periods_per_rev": 606.0}
+    rippled = replace(bare, effects=(Effect(h, np.array([values[q.name] for q in h.parameters])),))
+    (motion,) = (g for g in setup.held_out if g.window is not None)
+    errors, _ = segment_errors(setup.problem, (motion,), bare, rippled)
+    assert np.sqrt(errors.after[0, 2]) < 0.2 * np.sqrt(errors.before[0, 2])

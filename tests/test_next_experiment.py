@@ -25,7 +25,7 @@ def fitted(clean):
     def with_effect(effect, *p):
         h = named[effect, "elbow_joint"]
         model = Model(setup.problem.structure, baseline.model.par, (Effect(h, np.array(p, float)),))
-        return h, fit(setup.problem, model, base_names=setup.names, iterations=0, remainders=baseline.remainders)
+        return h, fit(setup.problem, model, iterations=0, remainders=baseline.remainders)
 
     return setup.problem, baseline, with_effect("hardening_stiffness", 1e9), with_effect("coulomb_friction", 0.2, 0.0, 1e-3)
 

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 
@@ -9,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from ident.excitation import make_plan, plan_from_toml
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, parameter_names
 from ident.hypotheses.structure import Change, apply_change
 from ident.show.export import build_mjcf
@@ -229,6 +232,21 @@ def test_all_outputs_are_written_whole(diagnosis, tmp_path):
     assert toml["effect"][0]["name"] == "coulomb_friction"
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml")).nu == 6
     assert (tmp_path / "out" / "recording.rrd").stat().st_size > 10_000
+
+
+def test_the_next_plan_is_written_and_an_old_one_taken_away(diagnosis, ur10, tmp_path):
+    plan = make_plan(ur10, points=1, validation_points=0, period=500, trajectory=False)
+    write_outputs(replace(diagnosis, next_plan=plan), tmp_path / "out")
+    again = plan_from_toml(tmp_path / "out" / "next_plan.toml")
+    assert len(again.experiments) == len(plan.experiments)
+    assert np.allclose(again.experiments[3].r, plan.experiments[3].r, atol=1e-9)
+    write_outputs(diagnosis, tmp_path / "out")
+    assert not (tmp_path / "out" / "next_plan.toml").exists()
+
+
+def test_figures_leave_the_callers_matplotlib_alone():
+    code = "import matplotlib as m; m.use('svg'); import ident.show.figures; assert m.get_backend() == 'svg'"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_failing_run_harms_no_earlier_output(diagnosis, tmp_path, monkeypatch):

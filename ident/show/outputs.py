@@ -11,6 +11,8 @@ from ident.show.recording import write_recording
 from ident.show.report import write_report
 from ident.verdict import Diagnosis
 
+NEXT_PLAN = "next_plan.toml"
+
 
 def write_outputs(diagnosis: Diagnosis, out: str | Path) -> None:
     """verdict.json, report.html, recording.rrd, model.toml and model.xml, and next_plan.toml where an
@@ -23,4 +25,6 @@ def write_outputs(diagnosis: Diagnosis, out: str | Path) -> None:
         write_model_toml(diagnosis, folder / "model.toml")
         write_mjcf(diagnosis, folder / "model.xml")
         if diagnosis.next_plan is not None:
-            plan_to_toml(diagnosis.next_plan, folder / "next_plan.toml")
+            plan_to_toml(diagnosis.next_plan, folder / NEXT_PLAN)
+    if diagnosis.next_plan is None:
+        (Path(out) / NEXT_PLAN).unlink(missing_ok=True)  # that of an earlier diagnosis
