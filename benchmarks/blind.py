@@ -5,6 +5,9 @@ nominal; the plant's step and integrator differ from case to case.
 
     python benchmarks/blind.py --size quick --out benchmarks/results/blind-quick
 
+Cases run side by side in processes, or on a Dask cluster (``--executor dask://HOST:PORT``) whose workers
+have this folder on their path.
+
 ``--kind mix`` draws the arm as well, and none, one, two or an effect that the catalogue lacks.
 """
 
@@ -12,11 +15,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import tempfile
 import time
 import traceback
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +31,7 @@ from ident.dataset import Dataset
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
 from ident.excitation import Plan, operating_points
+from ident.parallel import open_executor
 from robot_assets.robot import load_robot
 from sim import draw_effect, run_experiment
 from sim.effects import EFFECTS, parameters_of
@@ -186,15 +189,14 @@ def main() -> None:
     parser.add_argument("--kind", choices=(*KINDS, "mix"), default="one", help="what is hidden")
     parser.add_argument("--robot", default="ur10", help="folder or name of an arm; 'mix' draws one")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--executor", default="processes", help="processes, processes:N or dask://HOST:PORT")
     parser.add_argument("--cases", type=int, help="number of cases, instead of a size")
     parser.add_argument("--out", type=Path, help="stem of the results: .json, .txt and .png")
     args = parser.parse_args()
     names = ISSUE_SIX if args.effects == "six" else tuple(filter(None, args.effects.split(","))) or None
     cases = [(args.seed + i, names, args.kind, args.robot) for i in range(args.cases or SIZES[args.size])]
-    os.environ["SIMGAP_THREADS"] = "1"
-    with ProcessPoolExecutor(args.workers) as executor:
-        rows = run(cases, executor)
+    with open_executor(args.executor) as executor:
+        rows = run(cases, executor or ThreadPoolExecutor(1))
     text = table(rows)
     print(text)
     if args.out:

@@ -17,7 +17,7 @@ import scipy.stats
 
 from ident.extended import Effect, Model
 from ident.hypotheses import Hypothesis, Parameter, catalogue
-from ident.parallel import map_threads
+from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import (
     ANNEALING,
@@ -140,21 +140,21 @@ def attribute(
     *,
     max_causes: int = 4,
     hypotheses: Sequence[Hypothesis] | None = None,
-    progress: Callable[[str], None] | None = None,
+    workers: Workers = Workers(),
 ) -> Attribution:
     """Find the causes of what the baseline does not explain.
 
     Args:
         max_causes: rounds at most; an effect found at several joints at once is one of them.
+        workers: where candidates are fitted.
     """
     p_value = discrepancy_p_value(baseline)
     detected = p_value < DETECTION_LEVEL and baseline.chi2_per_dof > DETECTION_EXCESS
     hypotheses = tuple(hypotheses if hypotheses is not None else catalogue(problem.structure))
     current, rounds, unknown, count = baseline, [], False, 0
     while detected and count < max_causes and current.chi2_per_dof > DETECTION_EXCESS:
-        if progress is not None:
-            progress(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
-        found = attribute_once(problem, current, hypotheses, progress=progress)
+        workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
+        found = attribute_once(problem, current, hypotheses, workers)
         if not found.candidates:
             break
         best, before = found.candidates[0], found.before
@@ -287,8 +287,7 @@ def attribute_once(
     problem: Problem,
     current: Fit,
     hypotheses: Sequence[Hypothesis],
-    *,
-    progress: Callable[[str], None] | None = None,
+    workers: Workers = Workers(),
 ) -> Round:
     """One round: screen all, refit the best, weigh them.
 
@@ -297,21 +296,21 @@ def attribute_once(
     """
     before = current
     if current.chi2_per_dof < HOPELESS:
-        found, scores = explore(problem, current, hypotheses, current.chi2_per_dof > STRONG, progress)
+        found, scores = explore(problem, current, hypotheses, current.chi2_per_dof > STRONG, workers)
     else:
         found, scores = [], []
     excess = max(current.cost - current.count, 1.0)
     if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess:
-        before, found, scores = explore_softly(problem, current, found, hypotheses, progress)
+        before, found, scores = explore_softly(problem, current, found, hypotheses, workers)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
         if id(h) not in best or result.cost < best[id(h)][1].cost:
             best[id(h)] = h, result
     if not best:
         return Round(before, (), tuple(scores), 1.0)
-    before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost))
+    before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost), workers)
     if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count:
-        before, ranked = beside_strong(problem, before, ranked, scores, progress)
+        before, ranked = beside_strong(problem, before, ranked, scores, workers)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in ranked], before.count)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     return Round(before, tuple(weighed), tuple(scores), scale)
@@ -322,7 +321,7 @@ def explore_softly(
     current: Fit,
     direct: Sequence[tuple[Hypothesis, Fit]],
     hypotheses: Sequence[Hypothesis],
-    progress: Callable[[str], None] | None = None,
+    workers: Workers,
 ) -> tuple[Fit, list[tuple[Hypothesis, Fit]], list[Score]]:
     """Candidates sought from a softened model, and those found ``direct``, under weights of the former.
 
@@ -330,27 +329,28 @@ def explore_softly(
         The model without a new cause under these weights, candidates and scores.
     """
     stage, level = soften(problem, current)
-    found, scores = explore(problem, stage, hypotheses, True, progress, rough=True)
+    found, scores = explore(problem, stage, hypotheses, True, workers, rough=True)
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
     ways = [(h, r, (*ladder, sharp)) for h, r in found[:FINALISTS]]
     ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
 
-    def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> tuple[Hypothesis, Fit]:
-        h, result, steps = way
-        if progress is not None:
-            progress(f"finalist: {h.effect} at {h.place}")
+    def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> Fit | None:
+        _, result, steps = way
+        last = None
         for weights in steps:
-            result = refit(problem, result.model, weights, result.remainders) or result
-        return h, result
+            last = refit(problem, result.model, weights, result.remainders)
+            result = last or result
+        return last
 
-    finalists = [(h, r) for h, r in map_threads(sharpened, ways) if r.weights is sharp]
+    fits = workers.map(sharpened, ways, lambda way: f"finalist: {way[0].effect} at {way[0].place}")
+    finalists = [(h, r) for (h, _, _), r in zip(ways, fits, strict=True) if r is not None]
     return reweighted(problem, current, sharp), finalists, scores
 
 
 def under_noise_of_best(
-    problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
+    problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]], workers: Workers
 ) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
     """Candidates, and the model without them, under the noise that the best of them sees.
 
@@ -363,12 +363,13 @@ def under_noise_of_best(
     top = ranked[0][1]
     weights = make_weights(problem, predictions(problem, top.model, top.remainders), 0.0)
 
-    def moved(candidate: tuple[int, tuple[Hypothesis, Fit]]) -> tuple[Hypothesis, Fit]:
-        place, (h, r) = candidate
-        again = refit(problem, r.model, weights, r.remainders) if place < FINALISTS else None
-        return h, again or reweighted(problem, r, weights)
+    def moved(result: Fit) -> Fit | None:
+        return refit(problem, result.model, weights, result.remainders)
 
-    return reweighted(problem, before, weights), map_threads(moved, enumerate(ranked))
+    fits = workers.map(moved, [r for _, r in ranked[:FINALISTS]])
+    again = [*fits, *[None] * len(ranked[FINALISTS:])]
+    weighed = [(h, new or reweighted(problem, r, weights)) for (h, r), new in zip(ranked, again, strict=True)]
+    return reweighted(problem, before, weights), weighed
 
 
 def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
@@ -382,7 +383,7 @@ def explore(
     stage: Fit,
     hypotheses: Sequence[Hypothesis],
     regardless: bool,
-    progress: Callable[[str], None] | None = None,
+    workers: Workers,
     *,
     rough: bool = False,
 ) -> tuple[list[tuple[Hypothesis, Fit]], list[Score]]:
@@ -399,20 +400,19 @@ def explore(
     if not scores or not (regardless or scores[0].gain > worth * excess):
         return [], scores
 
-    def started(score: Score) -> tuple[Hypothesis, Fit | None]:
-        h = score.hypothesis
-        if progress is not None:
-            progress(f"refit: {h.effect} at {h.place}")
+    def started(score: Score) -> Fit | None:
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
-        return h, refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
+        return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
 
-    def finished(candidate: tuple[Hypothesis, Fit]) -> tuple[Hypothesis, Fit]:
-        h, r = candidate
-        return h, r if r.converged else refit(problem, r.model, stage.weights, r.remainders) or r
+    def finished(result: Fit) -> Fit:
+        return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
 
-    found = hopeful([(h, r) for h, r in map_threads(started, choose(scores)) if r is not None])
+    chosen = choose(scores)
+    fits = workers.map(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
+    found = hopeful([(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None])
     if not (rough and left_by(found) < ANSWERED * excess):
-        found = map_threads(finished, found)
+        last = workers.map(finished, [r for _, r in found])
+        found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores
 
 
@@ -433,9 +433,12 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
 def refit(
     problem: Problem, model: Model, weights: Weights, remainders: Sequence[np.ndarray], iterations: int = 10
 ) -> Fit | None:
-    """A candidate fitted from where screening put it; None where its model cannot be computed."""
+    """A candidate fitted from where screening put it.
+
+    None where its model cannot be computed, or ends where the data feel no change of its last effect.
+    """
     try:
-        return fit(
+        result = fit(
             problem,
             revived(problem, model),
             iterations=iterations,
@@ -444,6 +447,8 @@ def refit(
         )
     except NOT_COMPUTED:
         return None
+    felt = np.diag(result.information)[-len(result.model.effects[-1].p) :]
+    return result if np.any(felt > 0.0) else None
 
 
 def choose(scores: Sequence[Score]) -> list[Score]:
@@ -465,7 +470,7 @@ def beside_strong(
     before: Fit,
     ranked: Sequence[tuple[Hypothesis, Fit]],
     scores: Sequence[Score],
-    progress: Callable[[str], None] | None = None,
+    workers: Workers,
 ) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
     """Candidates, and the model without them, beside strong effects where one of those does better.
 
@@ -474,24 +479,22 @@ def beside_strong(
     Strong effects are therefore fitted from the starting guesses of the drives, under their own noise.
     """
 
-    def annealed(score: Score) -> tuple[Hypothesis, Fit | None]:
-        h = score.hypothesis
-        if progress is not None:
-            progress(f"strong: {h.effect} at {h.place}")
+    def annealed(score: Score) -> Fit | None:
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
-            return h, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
+            return anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
         except NOT_COMPUTED:
-            return h, None
+            return None
 
     likely = min(ranked, key=lambda x: x[1].cost)[0].joint
     chosen = strong_effects(problem, before, scores, likely)
-    strong = [(h, r) for h, r in map_threads(annealed, chosen) if r is not None]
+    fits = workers.map(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+    strong = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
     again = {h.key for h, _ in strong}
     others = [(h, r) for h, r in ranked if h.key not in again]
-    return under_noise_of_best(problem, before, sorted(strong, key=lambda x: x[1].cost) + others)
+    return under_noise_of_best(problem, before, sorted(strong, key=lambda x: x[1].cost) + others, workers)
 
 
 def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely: int) -> list[Score]:

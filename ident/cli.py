@@ -195,18 +195,22 @@ def diagnose(
     dataset: Path,
     out: Out,
     max_causes: Annotated[int, typer.Option(min=0)] = 4,
+    executor: Annotated[
+        str, typer.Option(help="Where candidates are fitted: threads, processes, processes:N or dask://HOST:PORT.")
+    ] = "threads",
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Everything: verdict.json, report.html, recording.rrd, model.toml and model.xml."""
     from ident.dataset_io import load_dataset
     from ident.diagnose import diagnose_fully
+    from ident.parallel import open_executor
     from ident.show.outputs import write_outputs
 
     data = load_dataset(dataset)
     _check_out(out)
-    with _progress(quiet or json_) as (say, _):
-        result = diagnose_fully(data, max_causes=max_causes, progress=say)
+    with open_executor(executor) as pool, _progress(quiet or json_) as (say, _):
+        result = diagnose_fully(data, max_causes=max_causes, progress=say, executor=pool)
         say("writing report and recording")
         write_outputs(result, out)
     _print(result.verdict.to_dict(), json_, _verdict_text(result.verdict, out))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from ident.inverse import Sampling
 from ident.link_sensor import LinkDelay, find_link_delays
 from ident.next_experiment import NextExperiment, advice, separating_experiment
 from ident.noise import sample_noise
-from ident.parallel import map_threads, one_thread_each
+from ident.parallel import Workers, one_thread_each
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
@@ -152,22 +153,38 @@ def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:
 
 
 def diagnose(
-    dataset: Dataset, *, max_causes: int = 4, progress: Callable[[str], None] | None = None
+    dataset: Dataset,
+    *,
+    max_causes: int = 4,
+    progress: Callable[[str], None] | None = None,
+    executor: Executor | None = None,
 ) -> Verdict:
     """Find what the simulation gets wrong; the verdict alone (see ``diagnose_fully``)."""
-    return diagnose_fully(dataset, max_causes=max_causes, progress=progress).verdict
+    return diagnose_fully(dataset, max_causes=max_causes, progress=progress, executor=executor).verdict
 
 
 @one_thread_each
 def diagnose_fully(
-    dataset: Dataset, *, max_causes: int = 4, progress: Callable[[str], None] | None = None
+    dataset: Dataset,
+    *,
+    max_causes: int = 4,
+    progress: Callable[[str], None] | None = None,
+    executor: Executor | None = None,
 ) -> Diagnosis:
-    """Identification, attribution, extension and gain, with all that reports show."""
+    """Identification, attribution, extension and gain, with all that reports show.
+
+    Args:
+        max_causes: rounds of attribution at most.
+        progress: told in a line what is done.
+        executor: of ``concurrent.futures``, for the fits of candidates; threads, one per core, where
+            None. Results are the same.
+    """
     began = time.perf_counter()
-    say = progress or (lambda text: None)
+    workers = Workers(executor, progress)
+    say = workers.say
     setup, baseline = identify(dataset, progress=say)
     problem = setup.problem
-    result = attribute(problem, baseline, max_causes=max_causes, progress=say)
+    result = attribute(problem, baseline, max_causes=max_causes, workers=workers)
     say("gain on held-out data")
     before, after = baseline.model, result.final.model
     first = predictions(problem, before, baseline.remainders)
@@ -179,7 +196,7 @@ def diagnose_fully(
         )
         shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
     else:
-        gain = leave_one_out(setup, result, affected)
+        gain = leave_one_out(setup, result, affected, workers)
         shown = problem.groups[:1]
         pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
     say("evidence")
@@ -207,7 +224,9 @@ def diagnose_fully(
     )
 
 
-def leave_one_out(setup: Setup, result: Attribution, affected: Sequence[int]) -> Gain | None:
+def leave_one_out(
+    setup: Setup, result: Attribution, affected: Sequence[int], workers: Workers = Workers()
+) -> Gain | None:
     """Gain by leaving out one operating point after another, both models refitted without it."""
     problem = setup.problem
     if len(problem.groups) < 2:
@@ -223,7 +242,7 @@ def leave_one_out(setup: Setup, result: Attribution, affected: Sequence[int]) ->
             )
         return segment_errors(problem, problem.groups[i : i + 1], *models)[0]
 
-    errors = map_threads(without, range(len(problem.groups)))
+    errors = workers.map(without, range(len(problem.groups)))
     joined = Errors(
         tuple(n for e in errors for n in e.segments),
         *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")),

@@ -155,8 +155,8 @@ class Motion:
         return self._time(self.solution.Q_a, coordinate, 1)
 
     def torque(self, joint: int) -> np.ndarray:
-        """Recorded motor torque, N m."""
-        return self._time(self.group.U, joint)
+        """Recorded motor torque without lines of noise alone, N m."""
+        return self._time(self.group.U, joint, share=self.group.torque_share[..., joint])
 
     @property
     def time(self) -> np.ndarray:

@@ -1,14 +1,22 @@
-"""Independent pieces of work on all cores."""
+"""Independent pieces of work: on the cores of this machine, or wherever an executor takes them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import wraps
+from multiprocessing import get_context
 from typing import ParamSpec, TypeVar
 
+import cloudpickle
 from threadpoolctl import threadpool_limits
+
+from robot_assets.errors import DataError
+
+THREADS_VARIABLE = "SIMGAP_THREADS"
 
 Arguments = ParamSpec("Arguments")
 Item = TypeVar("Item")
@@ -20,12 +28,25 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
 
     Threads serve because the work is in compiled code that releases the interpreter's lock. The
     environment variable ``SIMGAP_THREADS`` sets another number: 1 where processes share the cores.
+
+    Raises:
+        DataError: where that variable is not a whole number of threads.
     """
-    threads = int(os.environ.get("SIMGAP_THREADS", "0")) or os.cpu_count() or 1
+    threads = thread_count()
     if threads == 1:
         return [function(x) for x in items]
     with ThreadPoolExecutor(max_workers=threads) as pool:
         return list(pool.map(function, items))
+
+
+def thread_count() -> int:
+    """Threads that a process uses: ``SIMGAP_THREADS``, else one per core."""
+    given = os.environ.get(THREADS_VARIABLE, "")
+    if not given:
+        return os.cpu_count() or 1
+    if not given.isdecimal() or int(given) == 0:
+        raise DataError(THREADS_VARIABLE, "environment", given, "a whole number of threads, 1 or more")
+    return int(given)
 
 
 def one_thread_each(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -40,3 +61,92 @@ def one_thread_each(function: Callable[Arguments, Result]) -> Callable[Arguments
             return function(*args, **kwargs)
 
     return limited
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where the large pieces of a diagnosis run, and who is told.
+
+    Results do not depend on where: a piece is the same computation everywhere.
+
+    Attributes:
+        executor: any of ``concurrent.futures``; threads of this process, one per core, where None.
+        progress: told of every piece of work in a line.
+    """
+
+    executor: Executor | None = None
+    progress: Callable[[str], None] | None = None
+
+    def say(self, text: str) -> None:
+        if self.progress is not None:
+            self.progress(text)
+
+    def map(
+        self, function: Callable[[Item], Result], items: Iterable[Item], label: Callable[[Item], str] | None = None
+    ) -> list[Result]:
+        """``[function(x) for x in items]``, in order.
+
+        Args:
+            label: what to say of an item when it begins, or when it is handed to the executor.
+        """
+
+        def told(item: Item) -> Item:
+            if label is not None:
+                self.say(label(item))
+            return item
+
+        if self.executor is None:
+            return map_threads(lambda item: function(told(item)), items)
+        # Effects hold functions made on the spot, which the pickle of the standard library cannot send.
+        packed = cloudpickle.dumps(function)
+        futures = [self.executor.submit(_run_packed, packed, cloudpickle.dumps(told(item))) for item in items]
+        return [cloudpickle.loads(future.result()) for future in futures]
+
+
+@one_thread_each
+def _run_packed(function: bytes, item: bytes) -> bytes:
+    return cloudpickle.dumps(cloudpickle.loads(function)(cloudpickle.loads(item)))
+
+
+@contextmanager
+def open_executor(text: str) -> Iterator[Executor | None]:
+    """The executor that a command line asks for.
+
+    Args:
+        text: "threads" (None: of this process), "processes" or "processes:N", or "dask://HOST:PORT",
+            the scheduler of a Dask cluster whose workers have simgap installed.
+
+    Raises:
+        DataError: where it is none of these, or no scheduler answers.
+    """
+    kind, _, rest = text.partition(":")
+    if text == "threads":
+        yield None
+    elif kind == "processes" and (rest == "" or (rest.isdecimal() and int(rest) > 0)):
+        workers = int(rest) if rest else os.cpu_count() or 1
+        # A fork would copy the locks of threads that run now.
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_share_cores) as pool:
+            yield pool
+    elif kind == "dask" and rest.startswith("//") and rest[2:]:
+        with _dask(rest[2:]) as executor:
+            yield executor
+    else:
+        raise DataError("--executor", "command line", text, "threads, processes, processes:N or dask://HOST:PORT")
+
+
+def _share_cores() -> None:
+    os.environ[THREADS_VARIABLE] = "1"
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+    except ImportError as err:
+        raise DataError("--executor", "this installation", "no Dask", "pip install 'simgap[dask]'") from err
+    try:
+        client = Client(f"tcp://{address}", timeout="10s")
+    except (OSError, ValueError) as err:
+        raise DataError("--executor", f"dask://{address}", "no scheduler that answers", "a running Dask scheduler") from err
+    with client:
+        yield client.get_executor(pure=False)

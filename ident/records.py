@@ -46,7 +46,8 @@ class Group:
         temperature: (S, n) degC means, or None.
         period_time: s.
         periods: (S,) number of periods averaged.
-        white_noise: (n,) variance of a line of one period by the noise of its samples, rad2.
+        white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
+            rad2 and N2 m2.
     """
 
     operating_point: str
@@ -67,6 +68,7 @@ class Group:
     period_time: float
     periods: np.ndarray
     white_noise: np.ndarray
+    white_torque_noise: np.ndarray
 
     @cached_property
     def position_noise(self) -> np.ndarray:
@@ -74,12 +76,7 @@ class Group:
 
         By the scatter between periods; white where there is one period, by the noise of its samples.
         """
-        P = self.Q_periods.shape[1]
-        if P < 2:
-            return np.ones((len(self.omega), 1)) * self.white_noise
-        d = self.Q_periods - self.Q_periods.mean(axis=1, keepdims=True)
-        power = np.sum(np.abs(d) ** 2, axis=(0, 1)) / (len(d) * (P - 1) * P)
-        return mean_over_lines(power, NOISE_LINES)
+        return _line_noise(self.Q_periods, self.white_noise)
 
     @cached_property
     def signal_share(self) -> np.ndarray:
@@ -88,10 +85,12 @@ class Group:
         Laws that turn on a reversal see a noisy position reverse where the joint stands still; they
         are shown the motion without the lines that hold noise alone.
         """
-        share = 1.0 - SIGNAL_LEVEL * self.position_noise / np.maximum(np.abs(self.Q) ** 2, 1e-300)
-        share = np.maximum(share, 0.0)
-        share[:, 0] = 1.0
-        return share
+        return _signal_share(self.Q, self.position_noise)
+
+    @cached_property
+    def torque_share(self) -> np.ndarray:
+        """(S, L, n) the same of the torque: a law that clips it would clip its noise, and so explain that."""
+        return _signal_share(self.U, _line_noise(self.U_periods, self.white_torque_noise))
 
     @property
     def posture(self) -> np.ndarray:
@@ -112,6 +111,23 @@ class Group:
         if self.window is not None:
             X = self.to_lines(self.to_time(X) * self.window[:, None])
         return X[..., : self.n_compared, :]
+
+
+def _line_noise(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """(L, n) variance of a line of the mean over periods (S, P, L, n)."""
+    P = X_periods.shape[1]
+    if P < 2:
+        return np.ones((X_periods.shape[2], 1)) * white
+    d = X_periods - X_periods.mean(axis=1, keepdims=True)
+    power = np.sum(np.abs(d) ** 2, axis=(0, 1)) / (len(d) * (P - 1) * P)
+    return mean_over_lines(power, NOISE_LINES)
+
+
+def _signal_share(X: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Share of each line (S, L, n) that is signal; the mean is."""
+    share = np.maximum(1.0 - SIGNAL_LEVEL * noise / np.maximum(np.abs(X) ** 2, 1e-300), 0.0)
+    share[:, 0] = 1.0
+    return share
 
 
 def build_groups(
@@ -197,6 +213,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) ->
         period_time=N / fs,
         periods=np.array([s.steady_periods for s in members]),
         white_noise=np.mean([difference_noise(s.q) ** 2 for s in members], axis=0) / N,
+        white_torque_noise=np.mean([difference_noise(s.tau) ** 2 for s in members], axis=0) / N,
     )
 
 
@@ -250,6 +267,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
         period_time=N / fs,
         periods=np.ones(1, int),
         white_noise=difference_noise(segment.q) ** 2 / N,
+        white_torque_noise=difference_noise(segment.tau) ** 2 / N,
     )
 
 

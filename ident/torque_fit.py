@@ -28,6 +28,9 @@ ANNEALING = (0.5, 0.1, 0.02, 0.0)
 LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
 STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
 GAP = 1e-6  # relative change of the cost that ends a fit
+LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
+SHORTER = 64.0  # factor on the damping of steps then
+SETTLING_STEPS = 12  # of the remainder, before that
 
 
 @dataclass(frozen=True)
@@ -370,6 +373,7 @@ def fit(
     if weights is None:
         weights = make_weights(problem, preds, rho)
     cost = weighted_cost(problem, preds, weights)
+    settled = model, preds, Ws, cost
     # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
     trial_steps = int(any(e.hypothesis.channel == "model" for e in model.effects))
     moves, drift = _moves_links(model), np.zeros(len(x))
@@ -407,25 +411,42 @@ def fit(
         damping = max(damping / 10, 1e-9)
         preds, cost = new, new_cost
         if np.max(np.where(moves, drift, 0.0)) > STALE:
-            preds, Ws, cost = _renewed(problem, model, Ws, weights)
-            drift[:] = 0.0
+            kept, settled = settled, _settled(problem, settled, model, weights)
+            model, preds, Ws, cost = settled
+            x, drift = pack(model), np.zeros(len(x))
+            if settled is kept:
+                damping = max(damping, 1e-4) * SHORTER
+                continue
         if progress is not None:
             progress(f"fit: chi2/dof {cost / count:.3g}")
         if gain < max(GAP * cost, 0.02):
             converged = True
             break
     if np.any(drift):
-        preds, Ws, cost = _renewed(problem, model, Ws, weights)
+        model, preds, Ws, cost = _settled(problem, settled, model, weights)
     H, _ = _normal(problem, model, preds, weights)
     return Fit(model, cost, count, H, coordinate_names(model), tuple(Ws), weights, converged)
 
 
-def _renewed(
-    problem: Problem, model: Model, remainders: Sequence[np.ndarray], weights: Weights
-) -> tuple[list[Prediction], list[np.ndarray], float]:
-    """Predictions, geometric remainders and cost after a step of the remainders towards the model's own."""
-    preds = predictions(problem, model, remainders, steps=1)
-    return preds, [p.solution.W for p in preds], weighted_cost(problem, preds, weights)
+Settled = tuple[Model, list[Prediction], list[np.ndarray], float]
+"""A model, its predictions, the geometric remainders that they were made with, and its cost."""
+
+
+def _settled(problem: Problem, last: Settled, model: Model, weights: Weights) -> Settled:
+    """``model`` with geometric remainders a step towards its own, or more where one leads away, else ``last``.
+
+    Steps are taken with the remainder held. Where the links hang on gears that are far too soft the
+    remainder answers them so strongly that a step which lowers the cost raises it in truth.
+    """
+    for steps in (1, SETTLING_STEPS):
+        try:
+            preds = predictions(problem, model, last[2], steps=steps)
+            cost = weighted_cost(problem, preds, weights)
+        except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+            continue
+        if cost < LOST * last[3]:
+            return model, preds, [p.solution.W for p in preds], cost
+    return last
 
 
 def _moves_links(model: Model) -> np.ndarray:

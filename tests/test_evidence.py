@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from ident.attribute import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, weigh
+from ident.diagnose import diagnose
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
 from ident.torque_fit import joint_costs, predictions, weighted_cost
+from robot_assets.robot import load_robot
+from sim import parse_effect, run_experiment
+from tests.conftest import small_plan, through_files
 
 
 def candidate(h, p, information, cost=1000.0):
@@ -140,3 +144,13 @@ def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
     rough = np.random.default_rng(0).normal(size=smooth.shape)
     noisy = replace(segment, tau=segment.tau + rough)
     assert _noise(replace(data, segments=(noisy,), q_std=None, tau_std=None))[1] == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_motor_that_friction_holds_is_no_drive_that_saturates(tmp_path):
+    """A limit near zero would deliver nothing, and so explain a motor that hardly moves."""
+    robot = load_robot("twomass")
+    hidden = parse_effect("coulomb_friction@drive:torque=0.3", robot)
+    data = run_experiment(small_plan(robot, 4, period=1000), [hidden], seed=4)
+    verdict = diagnose(through_files(data, tmp_path))
+    assert verdict.discrepancy.detected
+    assert all(c.probability < 0.5 for c in verdict.causes if c.effect != "coulomb_friction")

@@ -7,6 +7,8 @@ import numpy as np
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.inverse import Motion
 
+LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
+
 
 def torque_constant(joint: int, place: str) -> Hypothesis:
     """Delivered torque is ``scale`` times the recorded one."""
@@ -83,10 +85,14 @@ def torque_delay(joint: int, place: str) -> Hypothesis:
 
 
 def torque_saturation(joint: int, place: str) -> Hypothesis:
-    """Delivered torque is clipped at ``limit``."""
+    """Delivered torque is clipped at ``limit``, which takes no more than the peaks.
+
+    A limit near zero would deliver nothing, and so explain any motor that hardly moves.
+    """
 
     def excess(limit: float, motion: Motion, j: int) -> np.ndarray:
         u = motion.torque(j)
+        limit = max(limit, LEAST_LIMIT * float(np.abs(u).max()))
         return u - np.clip(u, -limit, limit)
 
     return Hypothesis(

@@ -1,0 +1,80 @@
+"""Where work runs changes nothing of what comes out."""
+
+import json
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import pytest
+
+from ident.diagnose import diagnose
+from ident.parallel import Workers, map_threads, open_executor, thread_count
+from robot_assets.errors import DataError
+from robot_assets.robot import load_robot
+from sim import parse_effect, run_experiment
+from tests.conftest import small_plan, through_files
+
+
+@pytest.fixture(scope="module")
+def friction(tmp_path_factory):
+    """A small case with several candidates, and its verdict made on the threads of this process."""
+    robot = load_robot("twomass")
+    hidden = parse_effect("coulomb_friction@drive:torque=0.1", robot)
+    data = run_experiment(small_plan(robot, 4, period=1000, levels=(10.0, 4.0)), [hidden], seed=4)
+    data = through_files(data, tmp_path_factory.mktemp("two"))
+    return data, verdict_of(data)
+
+
+def verdict_of(data, **kwargs):
+    return json.dumps(diagnose(data, **kwargs).to_dict())
+
+
+def test_the_case_is_worth_the_comparison(friction):
+    causes = json.loads(friction[1])["causes"]
+    assert [c["effect"] for c in causes] == ["coulomb_friction"] and causes[0]["alternatives"]
+
+
+def test_processes_give_the_same_verdict_bit_for_bit(friction):
+    lines = []
+    with open_executor("processes:2") as executor:
+        assert verdict_of(friction[0], executor=executor, progress=lines.append) == friction[1]
+    assert any(line.startswith("refit: coulomb_friction") for line in lines)
+
+
+def test_a_dask_cluster_gives_the_same_verdict_bit_for_bit(friction):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        with open_executor(cluster.scheduler_address.replace("tcp", "dask")) as executor:
+            assert verdict_of(friction[0], executor=executor) == friction[1]
+
+
+@pytest.mark.parametrize("text", ["", "cores", "processes:0", "processes:two", "dask://", "dask:host", "threads:2"])
+def test_an_executor_that_is_none_is_refused(text):
+    with pytest.raises(DataError, match="--executor"):
+        with open_executor(text):
+            pass
+
+
+def test_a_scheduler_that_does_not_answer_is_named():
+    pytest.importorskip("distributed")
+    with pytest.raises(DataError, match=r"127\.0\.0\.1:9"):
+        with open_executor("dask://127.0.0.1:9"):
+            pass
+
+
+@pytest.mark.parametrize("given", ["two", "0", "-1", "1.5"])
+def test_a_number_of_threads_that_is_none_is_refused(monkeypatch, given):
+    monkeypatch.setenv("SIMGAP_THREADS", given)
+    with pytest.raises(DataError, match="SIMGAP_THREADS"):
+        map_threads(str, [1, 2])
+
+
+def test_threads_are_those_asked_for(monkeypatch):
+    monkeypatch.setenv("SIMGAP_THREADS", "3")
+    assert thread_count() == 3
+    assert map_threads(lambda x: x * x, range(5)) == [0, 1, 4, 9, 16]
+
+
+def test_functions_made_on_the_spot_reach_other_processes():
+    factor = 3
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        assert Workers(pool).map(lambda x: factor * x, [1, 2], str) == [3, 6]
