@@ -58,6 +58,7 @@ POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found abs
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
+RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
 WORTH_A_REFIT = 0.05  # the same for a screened gain: linear steps understate strong effects
 WORTH_A_REFIT_FAINT = 0.1  # the same where what is left is faint
 
@@ -103,19 +104,21 @@ class Attribution:
         return float(np.clip((self.final.chi2_per_dof - DETECTION_EXCESS) / before, 0.0, 1.0))
 
 
-def fit_baseline(problem: Problem, progress: Callable[[str], None] | None = None) -> Fit:
-    """Baseline parameters of the gray-box without effects.
+def fit_baseline(
+    problem: Problem, progress: Callable[[str], None] | None = None, effects: tuple[Effect, ...] = ()
+) -> Fit:
+    """Baseline parameters of the gray-box, with the ``effects`` that every candidate has too.
 
     Where the fit leaves more than the noise it is started again with other dampers: they are
     determined far worse than springs, and a damper that has once collapsed does not come back.
     """
-    start = Model(problem.structure, problem.nominal)
+    start = Model(problem.structure, problem.nominal, effects)
     best = first = anneal(problem, start, progress=progress)
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
             damping = np.maximum(par.damping, problem.nominal.damping) * factor
-            again = Model(problem.structure, replace(par, damping=damping))
+            again = replace(best.model, par=replace(par, damping=damping))
             other = anneal(
                 problem,
                 again,
@@ -311,9 +314,31 @@ def attribute_once(
     before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost), workers)
     if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
-    weighed = weigh([Candidate(h, result, 0.0) for h, result in ranked], before.count)
+    rivals, excess = rivals_of_best(problem, before, ranked)
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     return Round(before, tuple(weighed), tuple(scores), scale)
+
+
+def rivals_of_best(
+    problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
+) -> tuple[list[tuple[Hypothesis, Fit]], float]:
+    """Candidates that explain some of what the best one does, and the excess over noise that they leave there.
+
+    A real arm has causes at every joint: one that explains another joint is no alternative, and what is left
+    there is no error of this one. A change of the chain is seen at every joint.
+    """
+    best, top = ranked[0]
+    costs = [
+        joint_costs(problem, predictions(problem, r.model, r.remainders), r.weights) for r in (before, *(r for _, r in ranked))
+    ]
+    falls = [costs[0] - c for c in costs[1:]]
+    if best.channel == "model" or best.joint < 0 or falls[0].max() <= 0.0:
+        return list(ranked), max(top.cost - before.count, 0.0)
+    at = int(np.argmax(falls[0]))
+    kept = [k for k, fall in enumerate(falls) if fall[at] >= RIVAL * falls[0][at]]
+    left = min(costs[1 + k][at] for k in kept) - before.count / problem.structure.n
+    return [ranked[k] for k in kept], max(float(left), 0.0)
 
 
 def explore_softly(
@@ -529,16 +554,18 @@ def clip_to_bounds(h: Hypothesis, start: np.ndarray) -> np.ndarray:
     return np.array([np.clip(v, q.lower, q.upper) for v, q in zip(start, h.parameters, strict=True)])
 
 
-def weigh(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+def weigh(candidates: Sequence[Candidate], excess: float) -> list[Candidate]:
     """Probabilities of refitted hypotheses, best first.
 
     Under pure noise the evidence is half the difference of the costs. What the best model leaves
     above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
     difference counts only against ``TEMPER + MODEL_ERROR_SHARE x excess``. Parameters count by how far
     the data narrow them down (``occam``).
+
+    Args:
+        excess: cost beyond noise that the best of them leaves.
     """
     cost = np.array([c.fit.cost for c in candidates])
-    excess = max(cost.min() - count, 0.0)
     decoy = np.array([c.hypothesis.decoy for c in candidates], float)
     temper = TEMPER + MODEL_ERROR_SHARE / 6.0 * excess
     evidence = -0.5 * (cost - cost.min()) / temper - DECOY_NATS * decoy

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.attribute import Attribution, Candidate, Round, attribute, fit_baseline
+from ident.attribute import Attribution, attribute, fit_baseline
+from ident.conclude import baseline_values, conclude, named_effects
 from ident.dataset import Dataset
-from ident.extended import Effect, Prediction, predict
+from ident.extended import Effect, predict
 from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import (
     Parameters,
@@ -19,32 +20,29 @@ from ident.graybox import (
     build_structure,
     equilibrium,
     linearise,
-    parameter_unit,
     stiffness_diagonal,
 )
+from ident.hypotheses.sensing import torque_offset
 from ident.inverse import Sampling
-from ident.link_sensor import LinkDelay, find_link_delays
-from ident.next_experiment import NextExperiment, advice, separating_experiment
+from ident.link_sensor import find_link_delays
+from ident.next_experiment import separating_experiment
 from ident.noise import sample_noise
 from ident.parallel import Workers, one_thread_each
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
-from ident.reporting import affected_joints, describe, evidence_plot, frf_views, spectrum_map, torque_traces, where
+from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
+from ident.rigid import RigidFit, fit_rigid
 from ident.torque_fit import Fit, Problem, fit, predictions
-from ident.verdict import Alternative, Cause, Diagnosis, Discrepancy, Gain, Value, Verdict, Where
+from ident.trust import (
+    LEFT_ERROR,
+)
+from ident.verdict import Diagnosis, Gain, Verdict
 
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
 MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
-UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
-LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
-WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it
-CLEAR = 2.0  # held-out error of the baseline over the noise from which it tells
-CLOSED = 0.5  # share of the gap that the extended model must then close
-LEFT_ERROR = 3.0  # the same above which an unknown cause remains however strong the named ones are
-IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
-LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
+SETTLED_BY_INERTIAS = 0.5  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
 SEED = 0
 
 
@@ -142,16 +140,6 @@ def with_measured_noise(problem: Problem, result: Fit) -> Problem:
     return replace(problem, tau_std=np.maximum(tau, 1e-6), q_std=np.maximum(q, 1e-10))
 
 
-def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:
-    """Baseline parameters with standard deviations, and those the data do not determine."""
-    m = len(result.model.par.to_log())
-    x = np.exp(result.model.par.to_log())
-    std = np.sqrt(np.maximum(np.diag(result.covariance())[:m], 0.0))
-    names = result.names[:m]
-    values = {n: Value(float(v), float(v * s), parameter_unit(n)) for n, v, s in zip(names, x, std, strict=True)}
-    return values, tuple(n for n, s in zip(names, std, strict=True) if not s < UNDETERMINED)
-
-
 def diagnose(
     dataset: Dataset,
     *,
@@ -183,8 +171,11 @@ def diagnose_fully(
     workers = Workers(executor, progress)
     say = workers.say
     setup, baseline = identify(dataset, progress=say)
+    result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
+    rigid = None
+    if unresolved(result) and all(g.window is not None for g in setup.problem.groups):
+        setup, result, rigid = with_inertias(setup, result, max_causes, workers)
     problem = setup.problem
-    result = attribute(problem, baseline, max_causes=max_causes, workers=workers)
     say("gain on held-out data")
     before, after = baseline.model, result.final.model
     first = predictions(problem, before, baseline.remainders)
@@ -196,14 +187,14 @@ def diagnose_fully(
         )
         shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
     else:
-        gain = leave_one_out(setup, result, affected, workers)
+        gain = leave_one_out(setup, baseline, result, rigid is not None, affected, workers)
         shown = problem.groups[:1]
         pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
     say("evidence")
     last = predictions(problem, after, result.final.remainders)
     late = find_link_delays(problem, last)
     separating = separating_experiment(problem, result)
-    verdict = make_verdict(dataset, setup, result, gain, first, last, late, separating)
+    verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
     kept = result.rounds if len(verdict.causes) else ()
     return Diagnosis(
         verdict=verdict,
@@ -212,22 +203,59 @@ def diagnose_fully(
         frf=frf_views(dataset, problem, first, last),
         spectrum=spectrum_map(problem, baseline, first, last),
         evidence=tuple(
-            evidence_plot(problem, result.final, last, i) for i in range(min(len(kept), len(after.effects)))
+            evidence_plot(problem, result.final, last, effect, i)
+            for i, (effect, _) in enumerate(zip(named_effects(result.final), kept, strict=False))
         ),
         traces=torque_traces(dataset, shown, pairs),
         parameters={k: v.value for k, v in baseline_values(result.final)[0].items()},
         seconds=time.perf_counter() - began,
         next_plan=separating.plan if separating else None,
+        inertias=problem.structure.inertias,
         candidates=tuple(
             tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
         ),
     )
 
 
+def unresolved(result: Attribution) -> bool:
+    """Whether much of the discrepancy is left without a cause."""
+    final = result.final
+    return result.detected and (final.chi2_per_dof > LEFT_ERROR or result.unknown)
+
+
+def with_inertias(
+    setup: Setup, result: Attribution, max_causes: int, workers: Workers
+) -> tuple[Setup, Attribution, RigidFit | None]:
+    """Causes sought anew with inertias of the links and offsets of the torque found from motions, where that explains far more.
+
+    The links of a real arm are not those of its description, torque records have offsets, and friction is
+    judged wrongly beside both.
+    """
+    workers.say("inertias of the links")
+    problem = setup.problem
+    rigid = fit_rigid(problem.structure, problem.nominal, problem.groups)
+    problem = replace(problem, structure=rigid.structure, nominal=rigid.par)
+    offsets = tuple(Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names))
+    baseline = fit_baseline(problem, workers.say, offsets)
+    other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
+    if other.final.chi2_per_dof > SETTLED_BY_INERTIAS * result.final.chi2_per_dof:
+        return setup, result, None
+    return replace(setup, problem=problem), other, rigid
+
+
 def leave_one_out(
-    setup: Setup, result: Attribution, affected: Sequence[int], workers: Workers = Workers()
+    setup: Setup,
+    baseline: Fit,
+    result: Attribution,
+    renewed: bool,
+    affected: Sequence[int],
+    workers: Workers = Workers(),
 ) -> Gain | None:
-    """Gain by leaving out one operating point after another, both models refitted without it."""
+    """Gain by leaving out one operating point after another, both models refitted without it.
+
+    Args:
+        renewed: whether the inertias of the links were found too.
+    """
     problem = setup.problem
     if len(problem.groups) < 2:
         return None
@@ -235,11 +263,13 @@ def leave_one_out(
     def without(i: int) -> Errors:
         part = replace(problem, groups=tuple(g for k, g in enumerate(problem.groups) if k != i))
         models = []
-        for start in (result.baseline, result.final):
+        for start in (baseline, result.final):
             remainders = [W for k, W in enumerate(start.remainders) if k != i]
-            models.append(
-                fit(part, start.model, iterations=4, remainders=remainders).model
-            )
+            model = start.model
+            if renewed and start is result.final:
+                links = fit_rigid(build_structure(problem.structure.robot), problem.nominal, part.groups)
+                model = replace(model, structure=links.structure)
+            models.append(fit(part, model, iterations=4, remainders=remainders).model)
         return segment_errors(problem, problem.groups[i : i + 1], *models)[0]
 
     errors = workers.map(without, range(len(problem.groups)))
@@ -254,199 +284,3 @@ def leave_one_out(
         "leave-one-operating-point-out",
         np.random.default_rng(SEED),
     )
-
-
-def make_verdict(
-    dataset: Dataset,
-    setup: Setup,
-    result: Attribution,
-    gain: Gain | None,
-    first: Sequence[Prediction],
-    last: Sequence[Prediction],
-    late: Sequence[LinkDelay] = (),
-    separating: NextExperiment | None = None,
-) -> Verdict:
-    """Put the result into the words and numbers of verdict.json."""
-    final = result.final
-    left = result.left_share if result.detected else 0.0
-    refuted = result.unknown or fails_held_out(gain)
-    unknown = result.detected and (
-        refuted
-        or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)
-        or final.chi2_per_dof > LEFT_ERROR
-        or not final.model.effects
-    )
-    causes = []
-    trust = known_probability(left, refuted or collapsed(setup.problem, final)) if result.detected else 1.0
-    covariance = final.covariance()
-    rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
-    for effect in final.model.effects:
-        found = rounds[effect.hypothesis.key]
-        causes.append(_cause(effect, found.candidates, final, covariance, trust * explained_share(found, final)))
-    direct = [_rounded(x, dataset.joints[x.joint]) for x in setup.steps]
-    direct += [_late(x, dataset.joints[x.joint]) for x in late]
-    causes += direct
-    detected = result.detected or bool(direct)
-    seen = where(setup.problem, result.baseline, first) if result.detected else ()
-    if not seen:
-        seen += tuple(Where(dataset.joints[x.joint], "q", "position in steps", 1.0) for x in setup.steps)
-        seen += tuple(Where(dataset.joints[x.joint], "q_link", "position that follows the velocity", 1.0) for x in late)
-    verdict = "unknown cause remains" if unknown else "noise floor reached"
-    values, undetermined = baseline_values(final)
-    description = describe(setup.problem, final, last) if unknown else None
-    return Verdict(
-        dataset=dataset.name,
-        baseline=values,
-        discrepancy=Discrepancy(
-            detected,
-            0.0 if direct else result.p_value,
-            result.baseline.chi2_per_dof,
-            seen,
-        ),
-        causes=tuple(causes),
-        unexplained_share=float(left),
-        unexplained_verdict=verdict,
-        gain=gain,
-        next_experiment=separating.text if separating else advice(causes, unknown),
-        sentence=sentence(causes, unknown, detected, gain),
-        unidentified=undetermined,
-        residual_description=description,
-    )
-
-
-def _rounded(steps: Steps, joint: str) -> Cause:
-    """The cause of a position that comes in steps: seen in the samples, not weighed against others."""
-    return Cause(
-        effect="encoder_quantization",
-        joint=joint,
-        parameters={"resolution": Value(steps.resolution, steps.std, "rad")},
-        probability=0.99,
-        evidence=f"The position of {joint} takes steps of {steps.resolution:.3g} rad: its samples lie on a grid.",
-        alternatives=(),
-    )
-
-
-def _late(late: LinkDelay, joint: str) -> Cause:
-    """The cause of a link encoder that lags the motor encoder: the torque equation does not hold it."""
-    return Cause(
-        effect="sensor_delay",
-        joint=joint,
-        parameters={"delay": Value(late.delay, late.std, "s")},
-        probability=0.95,
-        evidence=f"The link encoder of {joint} comes {late.delay:.3g} s after its motor encoder: their difference"
-        " follows the velocity, which looks like wind-up of the gear and is not.",
-        alternatives=(),
-        channel="q_link",
-    )
-
-
-def explained_share(found: Round, final: Fit) -> float:
-    """What a cause explains, over that and what is left at the end: 1 where nothing is left.
-
-    A cause that explains less than the unknown may be the unknown's own shadow.
-    """
-    fall = max(found.before.cost - found.candidates[0].fit.cost, 0.0)
-    left = max(final.chi2_per_dof - LEFT_NOISE, 0.0) * final.count
-    return fall / max(fall + left, 1e-300)
-
-
-def fails_held_out(gain: Gain | None) -> bool:
-    """Whether held-out data refute the extended model: no name is trusted then.
-
-    It predicts them worse than the baseline, or leaves most of a clear error that the causes were named for.
-    """
-    if gain is None:
-        return False
-    clear = gain.before > CLEAR * gain.noise_floor and gain.gap_closed is not None
-    return gain.after > WORSE * gain.before or (clear and gain.gap_closed < CLOSED)
-
-
-def collapsed(problem: Problem, final: Fit) -> bool:
-    """Whether the final model explains the data badly and with drives that cannot be those of this arm.
-
-    Stiffness or motor inertia far from the starting guesses then stand for what is missing, and so may
-    the causes that were found beside them.
-    """
-    n, x = problem.structure.n, final.model.par.to_log() - problem.nominal.to_log()
-    drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
-    known = np.sqrt(np.maximum(np.diag(final.covariance())[drives], 0.0)) < UNDETERMINED
-    limit = np.log(IMPLAUSIBLE)
-    # A gear stiffer than the data can see ends anywhere above.
-    return final.chi2_per_dof > LEFT_ERROR and bool(np.any((x[drives] < -limit) | (known & (x[drives] > limit))))
-
-
-def known_probability(left: float, refuted: bool) -> float:
-    """How far the names can be trusted, from the share of the discrepancy that they leave."""
-    if refuted:
-        return 0.4
-    return float(1.0 / (1.0 + (left / 0.15) ** 2))
-
-
-def _cause(
-    effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float
-) -> Cause:
-    h = effect.hypothesis
-    same = [c for c in candidates if c.hypothesis.effect == h.effect and c.hypothesis.place == h.place]
-    own = sum(c.probability for c in same) if candidates else 1.0
-    others: dict[tuple[str, str], float] = {}
-    for c in candidates:
-        if c not in same and c.probability > 1e-3:
-            name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
-            others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
-    if h.options.get("trivial", lambda p: False)(effect.p):
-        trust *= known_probability(1.0, True)
-    parameters = reported_parameters(effect, final, covariance)
-    numbers = {k: v.value for k, v in parameters.items()}
-    return Cause(
-        effect=h.effect,
-        joint=h.place,
-        parameters=parameters,
-        probability=float(np.clip(own * trust, 0.0, 0.999)),
-        evidence=h.sentence.format(joint=h.place, **numbers),
-        alternatives=tuple(
-            Alternative(e, p, float(v * trust)) for (e, p), v in sorted(others.items(), key=lambda x: -x[1])
-        ),
-        channel="q" if h.channel == "position" else None,
-    )
-
-
-def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> dict[str, Value]:
-    """Parameters under their catalogue names, SI, with standard deviations."""
-    h = effect.hypothesis
-    index = {name: i for i, name in enumerate(final.names)}
-    out: dict[str, Value] = {}
-    std = {}
-    for q, v in zip(h.parameters, effect.p, strict=True):
-        i = index[f"{h.effect}@{h.place}:{q.name}"]
-        s = float(np.sqrt(max(covariance[i, i], 0.0)))
-        std[q.name] = s * abs(v) if q.log else s
-        if not q.nuisance:
-            out[q.name] = Value(float(v), std[q.name], q.unit)
-    if "sine" in out:
-        a, b = out.pop("sine"), out.pop("cosine")
-        amplitude = float(np.hypot(a.value, b.value))
-        sigma = float(np.hypot(a.std, b.std) / np.sqrt(2))
-        phase = float(np.arctan2(b.value, a.value))
-        out = {
-            "amplitude": Value(amplitude, sigma, a.unit),
-            **out,
-            "phase": Value(phase, sigma / max(amplitude, 1e-300), "rad"),
-        }
-    if h.effect in ("transverse_elasticity", "base_elasticity"):
-        axis = h.options["axis"]
-        out |= {f"axis_{n}": Value(float(a), 0.0, "1") for n, a in zip("xyz", axis, strict=True)}
-    return out
-
-
-def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain | None) -> str:
-    """The verdict in one sentence."""
-    if not detected:
-        return "The simulation agrees with the data: nothing beyond noise was found."
-    sure = [c for c in causes if c.probability > 0.5]
-    if not sure:
-        return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
-    names = " and ".join(f"{c.effect.replace('_', ' ')} at {c.joint} ({c.probability:.0%})" for c in sure)
-    of_torque = any(c.channel != "q_link" and c.effect != "encoder_quantization" for c in sure)
-    closed = "" if gain is None or gain.gap_closed is None or not of_torque else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
-    rest = ", and an unknown cause remains" if unknown else ""
-    return f"The simulation misses {names}{closed}{rest}."

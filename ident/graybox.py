@@ -58,7 +58,7 @@ class Structure:
         elastic: (n_e,) indices of the elastic hinges.
         bodies: link name -> (Pinocchio joint index, placement of the link frame in it).
         robot: the robot it was built from.
-        hinges, loads, links: what ``build_structure`` was given beyond the robot.
+        hinges, loads, links, inertias: what ``build_structure`` was given beyond the robot.
     """
 
     model: pin.Model
@@ -69,6 +69,7 @@ class Structure:
     hinges: tuple[Elasticity, ...] = ()
     loads: tuple[tuple[str, pin.Inertia], ...] = ()
     links: dict[str, LinkChange] = field(default_factory=dict)
+    inertias: dict[str, pin.Inertia] = field(default_factory=dict)
 
     @property
     def n(self) -> int:
@@ -158,14 +159,26 @@ def parameter_names(robot: Robot) -> tuple[str, ...]:
     return tuple(names)
 
 
+INERTIAL = (
+    "mass",
+    *(f"first_moment_{i}" for i in "xyz"),
+    *(f"inertia_{ij}" for ij in ("xx", "xy", "yy", "xz", "yz", "zz")),
+)
+"""Inertial parameters of a body in the frame of its joint, in the order of ``pin.Inertia.toDynamicParameters``."""
+
+
 def parameter_unit(name: str) -> str:
-    """SI unit of a parameter named by ``parameter_names``."""
+    """SI unit of a parameter named by ``parameter_names``, of one of ``INERTIAL``, or of an offset of the torque."""
+    kind = name.split(".")[0]
+    if kind in INERTIAL:
+        return "kg" if kind == "mass" else "kg m" if kind.startswith("first") else "kg m2"
     return {
         "stiffness": "N m/rad",
         "damping": "N m s/rad",
         "motor_inertia": "kg m2",
         "viscous_friction": "N m s/rad",
-    }[name.split(".")[0]]
+        "torque_offset": "N m",
+    }[kind]
 
 
 def build_structure(
@@ -174,6 +187,7 @@ def build_structure(
     elasticities: tuple[Elasticity, ...] = (),
     loads: tuple[tuple[str, pin.Inertia], ...] = (),
     links: dict[str, LinkChange] | None = None,
+    inertias: dict[str, pin.Inertia] | None = None,
 ) -> Structure:
     """Pinocchio chain of a robot, with elastic hinges and loads placed.
 
@@ -182,6 +196,8 @@ def build_structure(
         elasticities: elastic hinges beyond those of the robot.
         loads: (link name, inertia in that link's frame) beyond those of the robot.
         links: link name -> how its body differs from its description.
+        inertias: joint of the chain -> inertia of the body on it, loads of the robot included, instead
+            of what the description says.
 
     Raises:
         DataError: where the URDF lacks a joint or link that the robot names, or holds a joint
@@ -194,6 +210,7 @@ def build_structure(
     model.gravity.linear = np.asarray(robot.gravity, float)
     parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
     changed = {parent[link]: change for link, change in (links or {}).items()}
+    known = inertias or {}
     carrier = {0: _add_hinges(model, 0, "base", hinges, pin.SE3.Identity())}
     index: dict[str, int] = {}
     for i in range(1, source.njoints):
@@ -203,28 +220,30 @@ def build_structure(
         )
         index[name] = model.idx_vs[k]
         carrier[i] = _add_hinges(model, k, name, hinges, pin.SE3.Identity())
-        body = changed.get(i, LinkChange()).of(source.inertias[i])
+        body = changed.get(i, LinkChange()).of(known.get(model.names[carrier[i]], source.inertias[i]))
         model.appendBodyToJoint(carrier[i], body, pin.SE3.Identity())
     bodies = {
         f.name: (carrier[f.parentJoint], f.placement)
         for f in source.frames
         if f.type == pin.FrameType.BODY
     }
-    known = [
+    own = [
         (load.link, pin.Inertia(load.mass, np.asarray(load.com), np.asarray(load.inertia)))
         for load in robot.loads
     ]
-    for link, inertia in [*known, *loads]:
+    for k, (link, inertia) in enumerate([*own, *loads]):
         if link not in bodies:
             raise DataError("load", str(robot.folder), link, f"a link among {sorted(bodies)}")
         joint_index, placement = bodies[link]
+        if k < len(own) and model.names[joint_index] in known:
+            continue
         model.appendBodyToJoint(joint_index, inertia, placement)
     driven = np.array([index[name] for name in robot.joint_names])
     elastic = np.array(
         [model.idx_vs[model.getJointId(_hinge_name(h))] for h in hinges], dtype=int
     )
     return Structure(
-        model, driven, elastic, bodies, robot, tuple(elasticities), tuple(loads), dict(links or {})
+        model, driven, elastic, bodies, robot, tuple(elasticities), tuple(loads), dict(links or {}), dict(known)
     )
 
 

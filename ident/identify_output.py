@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ident.conclude import baseline_values
 from ident.dataset import Dataset
-from ident.diagnose import baseline_values, identify
+from ident.diagnose import identify
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.frf import estimate_frf
 from ident.graybox import Parameters, build_structure, parameter_unit

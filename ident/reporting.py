@@ -9,7 +9,7 @@ import numpy as np
 import scipy.fft
 
 from ident.dataset import Dataset, Segment
-from ident.extended import Model, Prediction, predict
+from ident.extended import Effect, Model, Prediction, predict
 from ident.frf import estimate_frf
 from ident.records import Group
 from ident.torque_fit import Fit, Problem, joint_costs, noise_covariance, residual
@@ -149,11 +149,12 @@ LABELS = {
 }
 
 
-def evidence_plot(problem: Problem, fit: Fit, predictions: Sequence[Prediction], index: int) -> EvidencePlot:
-    """Residual torque without one cause, against the variable that explains it, and with it."""
-    effect = fit.model.effects[index]
+def evidence_plot(
+    problem: Problem, fit: Fit, predictions: Sequence[Prediction], effect: Effect, cause: int
+) -> EvidencePlot:
+    """Residual torque without one effect, the ``cause`` of that number, against the variable that explains it, and with it."""
     h = effect.hypothesis
-    rest = Model(fit.model.structure, fit.model.par, tuple(e for i, e in enumerate(fit.model.effects) if i != index))
+    rest = Model(fit.model.structure, fit.model.par, tuple(e for e in fit.model.effects if e is not effect))
     j = max(h.joint, 0)
     xs, ys, ms = [], [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
@@ -185,7 +186,7 @@ def evidence_plot(problem: Problem, fit: Fit, predictions: Sequence[Prediction],
     if h.variable in ("posture", "frequency"):
         label = "torque of the fitted effect, N m"
     joint = problem.structure.robot.joint_names[j]
-    return EvidencePlot(index, f"{h.effect.replace('_', ' ')} at {h.place}", label, f"residual torque of {joint}, N m", x, y, x[order], m[order])
+    return EvidencePlot(cause, f"{h.effect.replace('_', ' ')} at {h.place}", label, f"residual torque of {joint}, N m", x, y, x[order], m[order])
 
 
 def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> str:

@@ -374,6 +374,9 @@ def fit(
         weights = make_weights(problem, preds, rho)
     cost = weighted_cost(problem, preds, weights)
     settled = model, preds, Ws, cost
+    if all(group.window is not None for group in problem.groups):
+        # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
+        prior = prior * max(1.0, cost / count)
     # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
     trial_steps = int(any(e.hypothesis.channel == "model" for e in model.effects))
     moves, drift = _moves_links(model), np.zeros(len(x))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from ident.excitation import Plan
 from robot_assets.robot import Robot
@@ -186,7 +187,10 @@ class FrfView:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything a report or recording shows."""
+    """Everything a report or recording shows.
+
+    ``inertias`` of bodies by joint of the chain, where they were found; ``parameters`` of the drives.
+    """
 
     verdict: Verdict
     robot: Robot
@@ -199,6 +203,7 @@ class Diagnosis:
     seconds: float
     candidates: tuple[tuple[tuple[str, str, float], ...], ...] = field(default=())
     next_plan: Plan | None = None
+    inertias: dict[str, pin.Inertia] = field(default_factory=dict)
 
 
 def _plain(x: Any) -> Any:

@@ -64,9 +64,9 @@ def test_an_absent_parameter_costs_nothing_unless_it_makes_the_effect(named):
 def test_a_law_and_its_limit_tie_where_the_data_cannot_tell_them_apart(named):
     gap, soft = named["backlash", "elbow_joint"], named["softening_stiffness", "elbow_joint"]
     one, two = candidate(gap, [5e-4], [1e5]), candidate(soft, [3e3, 3e-4], [0.0, 1e5])
-    assert [c.probability for c in weigh([one, two], 900)] == pytest.approx([0.5, 0.5], abs=0.01)
+    assert [c.probability for c in weigh([one, two], 100.0)] == pytest.approx([0.5, 0.5], abs=0.01)
     better = candidate(soft, [3e3, 3e-4], [0.0, 1e5], cost=900.0)
-    assert weigh([one, better], 900)[0].hypothesis is soft
+    assert weigh([one, better], 100.0)[0].hypothesis is soft
 
 
 def test_costs_by_joint_add_up_and_a_better_fit_explains_more(identified):
@@ -106,19 +106,27 @@ def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "noise", "refuted"),
-    [(10.0, 1.2, 1.0, False), (10.0, 9.0, 1.0, True), (10.0, 11.0, 9.9, True), (1.3, 1.2, 1.0, False)],
+    ("before", "after", "noise", "chi2", "refuted"),
+    [
+        (10.0, 1.2, 1.0, 1.0, False),
+        (10.0, 9.0, 1.0, 1.0, True),
+        (10.0, 11.0, 9.9, 1.0, True),
+        (1.3, 1.2, 1.0, 1.0, False),
+        (10.0, 3.0, 1.0, 1.0, True),  # explains what it was fitted to down to the noise, and nothing else so
+        (10.0, 3.0, 1.0, 40.0, False),  # leaves as much of both
+    ],
 )
-def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise, refuted):
-    from ident.diagnose import fails_held_out
+def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise, chi2, refuted):
+    from ident.trust import fails_held_out
     from ident.verdict import Gain
 
     closed = (before - after) / (before - noise)
-    assert fails_held_out(Gain(("a",), "RMS", before, after, noise, closed, (closed, closed), "validation segments")) is refuted
+    gain = Gain(("a",), "RMS", before, after, noise, closed, (closed, closed), "validation segments")
+    assert fails_held_out(gain, SimpleNamespace(chi2_per_dof=chi2)) is refuted
 
 
 def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
-    from ident.diagnose import collapsed
+    from ident.trust import collapsed
 
     _, setup, baseline = identified
     bad = replace(baseline, cost=10.0 * baseline.cost)

@@ -88,3 +88,23 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         "The encoder of {joint} errs by {amplitude:.3g} rad once a turn.",
         variable="q",
     )
+
+
+def torque_offset(joint: int, place: str) -> Hypothesis:
+    """A constant error of the recorded torque: no effect of the catalogue, but of every torque sensor."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        return p[0] * np.ones_like(motion.q(j))
+
+    return Hypothesis(
+        "torque_offset",
+        place,
+        joint,
+        "motor",
+        (Parameter("offset", "N m", -1e7, 1e7),),
+        law,
+        lambda scale: [()],
+        None,
+        "The recorded torque of {joint} is off by {offset:.3g} N m.",
+        options={"baseline": True},
+    )

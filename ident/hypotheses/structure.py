@@ -70,6 +70,7 @@ def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple
             elasticities=structure.hinges + change.elasticities,
             loads=structure.loads + change.loads,
             links=links,
+            inertias=structure.inertias,
         )
     coupling = par.coupling.copy()
     for row, column, ratio in change.coupling:
@@ -198,7 +199,7 @@ def link_inertia(link: str, joint_index: int) -> Hypothesis:
 
     def responses(structure, par, plane, group, solution, shape):
         joint, _ = structure.bodies[link]
-        bare = build_structure(structure.robot, links=structure.links)
+        bare = build_structure(structure.robot, links=structure.links, inertias=structure.inertias)
         own = bare.model.inertias[bare.bodies[link][0]]
         base = own.toDynamicParameters()
         changed = np.array([1.0, 0.0, 0.0, 0.0, 1.0]) + np.diag(LINK_STEPS)
@@ -311,7 +312,7 @@ def compliance(place: str, joint_index: int, axis: tuple[float, float, float], e
 
 def hinge_inertia(structure: Structure, hinge: Elasticity, group: Group, plane: Plane) -> float:
     """Inertia about a new hinge with everything else held, kg m2."""
-    wide = build_structure(structure.robot, elasticities=(hinge,))
+    wide = build_structure(structure.robot, elasticities=(hinge,), inertias=structure.inertias)
     q = np.zeros(wide.n_coordinates)
     q[wide.driven] = group.posture
     return float(linearise(wide, q).M[wide.elastic[-1], wide.elastic[-1]])

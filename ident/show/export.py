@@ -53,12 +53,17 @@ def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
 
 def write_mjcf(diagnosis: Diagnosis, path: Path) -> None:
     """MJCF of the extended model."""
-    spec = build_mjcf(diagnosis.robot, diagnosis.parameters, diagnosis.verdict.causes)
+    spec = build_mjcf(diagnosis.robot, diagnosis.parameters, diagnosis.verdict.causes, diagnosis.inertias)
     spec.compile()
     path.write_text(spec.to_xml(), encoding="utf-8")
 
 
-def build_mjcf(robot: Robot, parameters: dict[str, float], causes: Sequence[Cause] = ()) -> mujoco.MjSpec:
+def build_mjcf(
+    robot: Robot,
+    parameters: dict[str, float],
+    causes: Sequence[Cause] = (),
+    inertias: dict[str, pin.Inertia] | None = None,
+) -> mujoco.MjSpec:
     """A MuJoCo arm with identified parameters and named effects.
 
     Bodies are written from the Pinocchio chain. A motor is a rotor beside the chain; a fixed
@@ -68,6 +73,7 @@ def build_mjcf(robot: Robot, parameters: dict[str, float], causes: Sequence[Caus
 
     Args:
         parameters: by the names of ``ident.graybox.parameter_names``.
+        inertias: of bodies by joint of the chain, instead of those of the description.
     """
     hinges = tuple(
         replace(
@@ -81,7 +87,7 @@ def build_mjcf(robot: Robot, parameters: dict[str, float], causes: Sequence[Caus
     loads = tuple(_payload(robot, c) for c in causes if c.effect == "payload")
     links = {c.joint: _link_change(c) for c in causes if c.effect == "link_inertia"}
     arm = replace(robot, elasticities=hinges)
-    structure = build_structure(arm, elasticities=hidden, loads=loads, links=links)
+    structure = build_structure(arm, elasticities=hidden, loads=loads, links=links, inertias=inertias)
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
     spec.compiler.degree = False  # else angles such as springref are taken as degrees

@@ -1,0 +1,245 @@
+"""The conclusion of a diagnosis: fits put into the words and numbers of verdict.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.attribute import Attribution, Candidate
+from ident.dataset import Dataset
+from ident.extended import Effect, Prediction
+from ident.graybox import INERTIAL, parameter_unit
+from ident.link_sensor import LinkDelay
+from ident.next_experiment import NextExperiment, advice
+from ident.quantization import Steps
+from ident.reporting import describe, where
+from ident.rigid import RigidFit
+from ident.torque_fit import Fit, Problem
+from ident.trust import (
+    LEFT_ERROR,
+    LEFT_NOISE,
+    UNDETERMINED,
+    collapsed,
+    explained_share,
+    fails_held_out,
+    known_probability,
+    left_of,
+)
+from ident.verdict import Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
+
+LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
+
+
+def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:
+    """Baseline parameters with standard deviations, and those the data do not determine."""
+    m = len(result.model.par.to_log())
+    x = np.exp(result.model.par.to_log())
+    std = np.sqrt(np.maximum(np.diag(result.covariance())[:m], 0.0))
+    names = result.names[:m]
+    values = {n: Value(float(v), float(v * s), parameter_unit(n)) for n, v, s in zip(names, x, std, strict=True)}
+    return values, tuple(n for n, s in zip(names, std, strict=True) if not s < UNDETERMINED)
+
+
+def conclude(
+    dataset: Dataset,
+    problem: Problem,
+    steps: Sequence[Steps],
+    baseline: Fit,
+    result: Attribution,
+    gain: Gain | None,
+    first: Sequence[Prediction],
+    last: Sequence[Prediction],
+    late: Sequence[LinkDelay] = (),
+    separating: NextExperiment | None = None,
+    rigid: RigidFit | None = None,
+) -> Verdict:
+    """Put the result into the words and numbers of verdict.json.
+
+    Args:
+        baseline: the first model, and ``first`` what it predicts.
+        rigid: inertias of the links where they were found too: ``result`` is then about the model with them.
+    """
+    final = result.final
+    left = result.left_share if result.detected else 0.0
+    refuted = result.unknown or fails_held_out(gain, final)
+    unknown = result.detected and (
+        refuted
+        or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)
+        or final.chi2_per_dof > LEFT_ERROR
+        or not named_effects(final)
+    )
+    causes = []
+    doubted = refuted or collapsed(problem, final)
+    covariance = final.covariance()
+    rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
+    for effect in named_effects(final):
+        found = rounds[effect.hypothesis.key]
+        trust = known_probability(left_of(problem, effect, result), doubted)
+        trust *= explained_share(problem, found, final)
+        causes.append(_cause(effect, found.candidates, final, covariance, trust))
+    direct = [_rounded(x, dataset.joints[x.joint]) for x in steps]
+    direct += [_late(x, dataset.joints[x.joint]) for x in late]
+    causes += direct
+    detected = result.detected or bool(direct)
+    seen = where(problem, baseline, first) if result.detected else ()
+    if not seen:
+        seen += tuple(Where(dataset.joints[x.joint], "q", "position in steps", 1.0) for x in steps)
+        seen += tuple(Where(dataset.joints[x.joint], "q_link", "position that follows the velocity", 1.0) for x in late)
+    verdict = "unknown cause remains" if unknown else "noise floor reached"
+    values, undetermined = baseline_values(final)
+    if rigid is not None:
+        links = inertia_values(rigid) | offset_values(final, covariance)
+        values |= links
+        undetermined += tuple(k for k, v in links.items() if not v.std < UNDETERMINED * abs(v.value))
+    description = describe(problem, final, last) if unknown else None
+    return Verdict(
+        dataset=dataset.name,
+        baseline=values,
+        discrepancy=Discrepancy(
+            detected,
+            0.0 if direct else result.p_value,
+            baseline.chi2_per_dof,
+            seen,
+        ),
+        causes=tuple(causes),
+        unexplained_share=float(left),
+        unexplained_verdict=verdict,
+        gain=gain,
+        next_experiment=separating.text if separating else advice(causes, unknown),
+        sentence=sentence(causes, unknown, detected, gain),
+        unidentified=undetermined,
+        residual_description=description,
+        notes=() if rigid is None else (inertia_note(problem, rigid, baseline, result),),
+    )
+
+
+def named_effects(final: Fit) -> tuple[Effect, ...]:
+    """The effects of a model that are causes, and no part of its baseline."""
+    return tuple(e for e in final.model.effects if not e.hypothesis.options.get("baseline"))
+
+
+def offset_values(final: Fit, covariance: np.ndarray) -> dict[str, Value]:
+    """Offsets of the torque records, N m."""
+    return {
+        f"torque_offset.{e.hypothesis.place}": reported_parameters(e, final, covariance)["offset"]
+        for e in final.model.effects
+        if e.hypothesis.options.get("baseline")
+    }
+
+
+def inertia_values(rigid: RigidFit) -> dict[str, Value]:
+    """Mass, first moment and inertia about the joint of every body, with standard deviations."""
+    out = {}
+    for body, std in zip(rigid.bodies, rigid.std, strict=True):
+        model = rigid.structure.model
+        p = model.inertias[model.getJointId(body)].toDynamicParameters()
+        for kind, v, s in zip(INERTIAL, p, std, strict=True):
+            name = f"{kind}.{body}"
+            out[name] = Value(float(v), float(s), parameter_unit(name))
+    return out
+
+
+def inertia_note(problem: Problem, rigid: RigidFit, baseline: Fit, result: Attribution) -> str:
+    """What the inertias of the links do, in a sentence."""
+    before, after = (np.sqrt(x.chi2_per_dof) for x in (baseline, result.baseline))
+    return (
+        f"The inertias of {len(rigid.bodies)} links were found from the motions, which show {rigid.rank} combinations of"
+        f" them and the drives; by themselves they bring the torque error from {before:.3g} to {after:.3g} times the noise."
+    )
+
+
+def _rounded(steps: Steps, joint: str) -> Cause:
+    """The cause of a position that comes in steps: seen in the samples, not weighed against others."""
+    return Cause(
+        effect="encoder_quantization",
+        joint=joint,
+        parameters={"resolution": Value(steps.resolution, steps.std, "rad")},
+        probability=0.99,
+        evidence=f"The position of {joint} takes steps of {steps.resolution:.3g} rad: its samples lie on a grid.",
+        alternatives=(),
+    )
+
+
+def _late(late: LinkDelay, joint: str) -> Cause:
+    """The cause of a link encoder that lags the motor encoder: the torque equation does not hold it."""
+    return Cause(
+        effect="sensor_delay",
+        joint=joint,
+        parameters={"delay": Value(late.delay, late.std, "s")},
+        probability=0.95,
+        evidence=f"The link encoder of {joint} comes {late.delay:.3g} s after its motor encoder: their difference"
+        " follows the velocity, which looks like wind-up of the gear and is not.",
+        alternatives=(),
+        channel="q_link",
+    )
+
+
+def _cause(
+    effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float
+) -> Cause:
+    h = effect.hypothesis
+    same = [c for c in candidates if c.hypothesis.effect == h.effect and c.hypothesis.place == h.place]
+    own = sum(c.probability for c in same) if candidates else 1.0
+    others: dict[tuple[str, str], float] = {}
+    for c in candidates:
+        if c not in same and c.probability > 1e-3:
+            name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
+            others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
+    if h.options.get("trivial", lambda p: False)(effect.p):
+        trust *= known_probability(1.0, True)
+    parameters = reported_parameters(effect, final, covariance)
+    numbers = {k: v.value for k, v in parameters.items()}
+    return Cause(
+        effect=h.effect,
+        joint=h.place,
+        parameters=parameters,
+        probability=float(np.clip(own * trust, 0.0, 0.999)),
+        evidence=h.sentence.format(joint=h.place, **numbers),
+        alternatives=tuple(
+            Alternative(e, p, float(v * trust)) for (e, p), v in sorted(others.items(), key=lambda x: -x[1])
+        ),
+        channel="q" if h.channel == "position" else None,
+    )
+
+
+def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> dict[str, Value]:
+    """Parameters under their catalogue names, SI, with standard deviations."""
+    h = effect.hypothesis
+    index = {name: i for i, name in enumerate(final.names)}
+    out: dict[str, Value] = {}
+    std = {}
+    for q, v in zip(h.parameters, effect.p, strict=True):
+        i = index[f"{h.effect}@{h.place}:{q.name}"]
+        s = float(np.sqrt(max(covariance[i, i], 0.0)))
+        std[q.name] = s * abs(v) if q.log else s
+        if not q.nuisance:
+            out[q.name] = Value(float(v), std[q.name], q.unit)
+    if "sine" in out:
+        a, b = out.pop("sine"), out.pop("cosine")
+        amplitude = float(np.hypot(a.value, b.value))
+        sigma = float(np.hypot(a.std, b.std) / np.sqrt(2))
+        phase = float(np.arctan2(b.value, a.value))
+        out = {
+            "amplitude": Value(amplitude, sigma, a.unit),
+            **out,
+            "phase": Value(phase, sigma / max(amplitude, 1e-300), "rad"),
+        }
+    if h.effect in ("transverse_elasticity", "base_elasticity"):
+        axis = h.options["axis"]
+        out |= {f"axis_{n}": Value(float(a), 0.0, "1") for n, a in zip("xyz", axis, strict=True)}
+    return out
+
+
+def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain | None) -> str:
+    """The verdict in one sentence."""
+    if not detected:
+        return "The simulation agrees with the data: nothing beyond noise was found."
+    sure = [c for c in causes if c.probability > 0.5]
+    if not sure:
+        return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
+    names = " and ".join(f"{c.effect.replace('_', ' ')} at {c.joint} ({c.probability:.0%})" for c in sure)
+    of_torque = any(c.channel != "q_link" and c.effect != "encoder_quantization" for c in sure)
+    closed = "" if gain is None or gain.gap_closed is None or not of_torque else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
+    rest = ", and an unknown cause remains" if unknown else ""
+    return f"The simulation misses {names}{closed}{rest}."

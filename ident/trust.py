@@ -1,0 +1,92 @@
+"""How far names can be trusted: by what is left where they sit, by held-out data, by the drives beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.attribute import DETECTION_EXCESS, Attribution, Round
+from ident.extended import Effect
+from ident.torque_fit import Fit, Problem, joint_costs, predictions
+from ident.verdict import Gain
+
+LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
+UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
+WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it
+CLEAR = 2.0  # held-out error of the baseline over the noise from which it tells
+CLOSED = 0.5  # share of the gap that the extended model must then close
+CARRIED = 0.8  # the same where it explains the data that it was fitted to down to the noise
+ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
+LEFT_ERROR = 3.0  # the same above which an unknown cause remains however strong the named ones are
+IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
+
+
+def _at(effect: Effect, costs: np.ndarray) -> float:
+    """Of costs by joint, those that an effect answers for: its joint, or all where it changes the chain."""
+    h = effect.hypothesis
+    return float(costs[h.joint] if h.joint >= 0 and h.channel != "model" else np.sum(costs))
+
+
+def _excess(problem: Problem, result: Fit, level: float) -> np.ndarray:
+    """(n,) whitened cost of a fit by joint beyond ``level`` times the noise."""
+    costs = joint_costs(problem, predictions(problem, result.model, result.remainders), result.weights)
+    return np.maximum(costs - level * result.count / problem.structure.n, 0.0)
+
+
+def left_of(problem: Problem, effect: Effect, result: Attribution) -> float:
+    """Share of the discrepancy that is left where an effect sits, 0 to 1: there no other cause hides behind it."""
+    before = _at(effect, _excess(problem, result.baseline, 1.0))
+    after = _at(effect, _excess(problem, result.final, DETECTION_EXCESS))
+    return float(np.clip(after / max(before, 1e-300), 0.0, 1.0)) if after > 0.0 else 0.0
+
+
+def explained_share(problem: Problem, found: Round, final: Fit) -> float:
+    """What a cause explains where it sits, over that and what is left there at the end: 1 where nothing is left.
+
+    A cause that explains less than the unknown may be the unknown's own shadow.
+    """
+    after = found.candidates[0].fit
+    effect = after.model.effects[-1]
+    effect = next((e for e in after.model.effects if e.hypothesis.key == found.candidates[0].hypothesis.key), effect)
+    fall = max(_at(effect, _excess(problem, found.before, 0.0)) - _at(effect, _excess(problem, after, 0.0)), 0.0)
+    left = _at(effect, _excess(problem, final, LEFT_NOISE))
+    return fall / max(fall + left, 1e-300)
+
+
+def fails_held_out(gain: Gain | None, final: Fit) -> bool:
+    """Whether held-out data refute the extended model: no name is trusted then.
+
+    It predicts them worse than the baseline, or leaves most of a clear error that the causes were named for;
+    or it explains the data it was fitted to, and leaves more of the held-out ones than a model that is right.
+    """
+    if gain is None:
+        return False
+    if gain.after > WORSE * gain.before:
+        return True
+    if gain.gap_closed is None or not gain.before > CLEAR * gain.noise_floor:
+        return False
+    settled = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
+    return gain.gap_closed < (CARRIED if settled else CLOSED)
+
+
+def collapsed(problem: Problem, final: Fit) -> bool:
+    """Whether the final model explains the data badly and with drives that cannot be those of this arm.
+
+    Stiffness or motor inertia far from the starting guesses then stand for what is missing, and so may
+    the causes that were found beside them.
+    """
+    n, x = problem.structure.n, final.model.par.to_log() - problem.nominal.to_log()
+    drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
+    known = np.sqrt(np.maximum(np.diag(final.covariance())[drives], 0.0)) < UNDETERMINED
+    limit = np.log(IMPLAUSIBLE)
+    # A gear stiffer than the data can see ends anywhere above, and motions hardly show a small motor beside its link.
+    low = x[drives] < -limit
+    if all(group.window is not None for group in problem.groups):
+        low &= known
+    return final.chi2_per_dof > LEFT_ERROR and bool(np.any(low | (known & (x[drives] > limit))))
+
+
+def known_probability(left: float, refuted: bool) -> float:
+    """How far the names can be trusted, from the share of the discrepancy that they leave."""
+    if refuted:
+        return 0.4
+    return float(1.0 / (1.0 + (left / 0.15) ** 2))

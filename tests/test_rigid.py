@@ -1,0 +1,151 @@
+"""Inertias of the links from motions: the regressor, consistency, and links that differ from their description."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.dataset import Dataset, Segment
+from ident.diagnose import diagnose_fully, set_up
+from ident.graybox import LinkChange, Parameters, build_structure
+from ident.recursion import chain_of
+from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, fit_rigid, regressor
+from sim import parse_effect, run_experiment
+from sim.experiment import draw_drives
+from tests.conftest import small_plan, through_files
+
+RATE = 250.0
+CHANGED = {
+    "forearm_link": LinkChange(1.4, (0.02, -0.01, 0.03), 1.3),
+    "wrist_3_link": LinkChange(4.0, (0.0, 0.01, 0.04), 3.0),
+}
+COULOMB, OFFSET = np.array([8.0, 9.0, 5.0, 1.0, 0.8, 0.5]), np.array([0.5, -2.0, 1.0, 0.2, -0.1, 0.05])
+
+
+def rigid_motion(robot, seed, seconds=20.0):
+    """A recorded motion of a rigid arm whose links are not as described; torques by Pinocchio."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * RATE)) / RATE
+    w = 2 * np.pi * 0.1 * np.arange(1, 6)
+    a, b = rng.normal(size=(2, 5, robot.n)) * 0.25
+    arg = np.multiply.outer(t, w)
+    q = np.sin(arg) @ a + np.cos(arg) @ b + rng.uniform(-0.5, 0.5, robot.n)
+    v = (np.cos(arg) * w) @ a - (np.sin(arg) * w) @ b
+    acc = -(np.sin(arg) * w**2) @ a - (np.cos(arg) * w**2) @ b
+    structure, par = build_structure(robot, links=CHANGED), Parameters.nominal(robot)
+    data = structure.model.createData()
+    tau = np.array([pin.rnea(structure.model, data, *x) for x in zip(q, v, acc, strict=True)])
+    tau += par.inertia * acc + 1.5 * par.viscous * v + COULOMB * np.sign(v) + OFFSET
+    return t, q, tau + 0.02 * rng.normal(size=tau.shape)
+
+
+def dataset_of(robot, *segments):
+    return Dataset(
+        name="motions",
+        robot_ref="ur10",
+        robot=robot,
+        sample_rate=RATE,
+        joints=robot.joint_names,
+        input_hold="none",
+        q_std=np.full(robot.n, 1e-7),
+        tau_std=np.full(robot.n, 0.02),
+        controller=None,
+        segments=segments,
+    )
+
+
+@pytest.fixture(scope="module")
+def moved(ur10):
+    segments = []
+    for i, role in enumerate(("identification", "identification", "validation")):
+        t, q, tau = rigid_motion(ur10, i)
+        segments.append(Segment(name=f"m{i}", role=role, kind="trajectory", t=t, tau=tau, q=q))
+    return dataset_of(ur10, *segments)
+
+
+def test_the_regressor_is_that_of_pinocchio(ur10):
+    model = build_structure(ur10).model
+    q, v, a = np.random.default_rng(0).normal(size=(3, 20, 6))
+    ours = regressor(chain_of(model), q, v, a, range(6))
+    data = model.createData()
+    theirs = np.array([pin.computeJointTorqueRegressor(model, data, *x) for x in zip(q, v, a, strict=True)])
+    assert np.allclose(ours, theirs, atol=1e-9 * np.abs(theirs).max())
+
+
+def test_pseudo_inertias_hold_the_ten_parameters(ur10):
+    for body in list(build_structure(ur10).model.inertias)[1:]:
+        p = body.toDynamicParameters()
+        assert np.allclose(_from_pseudo(_pseudo(p)), p)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-2.0, 2.0), min_size=10, max_size=10))
+def test_every_coordinate_is_a_body_that_can_be(x):
+    box = pin.Inertia.FromBox(3.0, 0.1, 0.2, 0.4)
+    root = _root(pin.Inertia(3.0, np.array([0.1, 0.0, 0.2]), box.inertia).toDynamicParameters())
+    p, slope = _inertias(root[None], np.array(x))
+    moments = np.linalg.eigvalsh(_pseudo(p[0]))
+    assert p[0, 0] > 0 and moments[0] > -1e-12 * moments[-1]
+    steps = 1e-6 * np.eye(10)
+    change = [(_inertias(root[None], np.array(x) + e)[0] - _inertias(root[None], np.array(x) - e)[0])[0] / 2e-6 for e in steps]
+    assert np.allclose(slope[0], np.array(change).T, atol=1e-5 * max(1.0, np.abs(p).max()))
+
+
+def test_links_that_are_not_as_described_are_found(moved, ur10):
+    problem = set_up(moved).problem
+    found = fit_rigid(problem.structure, problem.nominal, problem.groups)
+    assert np.all(found.left < 0.03 * np.array([g.U.std() for g in problem.groups]).max())
+    # What the motions show is the torque along other motions, not each inertia by itself.
+    truth = build_structure(ur10, links=CHANGED)
+    q, v, a = np.random.default_rng(9).normal(size=(3, 200, 6))
+    torques = []
+    for structure in (build_structure(ur10), found.structure, truth):
+        data = structure.model.createData()
+        torques.append(np.array([pin.rnea(structure.model, data, *x) for x in zip(q, v, a, strict=True)]))
+    described, fitted, true = torques
+    true, fitted, described = (x + p * a for x, p in ((true, problem.nominal.inertia), (fitted, found.par.inertia), (described, problem.nominal.inertia)))
+    error, gap = (np.sqrt(np.mean((x - true) ** 2, axis=0)) for x in (fitted, described))
+    assert np.all(error[1:] < 0.1 * gap[1:])
+
+
+def test_links_as_described_stay_as_they_are(ur10):
+    t, q, tau = rigid_motion(ur10, 3)
+    structure = build_structure(ur10)
+    still = np.tile(pin.computeGeneralizedGravity(structure.model, structure.model.createData(), q[0]), (len(t), 1))
+    rest = Segment(name="m", role="identification", kind="trajectory", t=t, tau=still, q=np.tile(q[:1], (len(t), 1)))
+    problem = set_up(dataset_of(ur10, rest)).problem
+    found = fit_rigid(problem.structure, problem.nominal, problem.groups)
+    for i in range(1, 7):
+        assert found.structure.model.inertias[i].mass == pytest.approx(structure.model.inertias[i].mass, rel=0.05)
+
+
+def test_friction_is_named_beside_links_that_differ_from_their_description(moved, tmp_path):
+    """One round: without the inertias of the links friction would be judged beside wrong torques."""
+    result = diagnose_fully(through_files(moved, tmp_path), max_causes=1)
+    verdict = result.verdict
+    named = {c.joint: c for c in verdict.causes if c.effect == "coulomb_friction" and c.probability > 0.5}
+    assert set(named) == set(result.joints)
+    for joint, torque, offset in zip(result.joints, COULOMB, OFFSET, strict=True):
+        assert named[joint].parameters["torque"].value == pytest.approx(torque, rel=0.05)
+        constant = verdict.baseline[f"torque_offset.{joint}"].value + torque * named[joint].parameters["asymmetry"].value
+        assert constant == pytest.approx(offset, abs=0.1 + 0.02 * torque)
+    assert verdict.gain.gap_closed > 0.95
+    assert "inertias of 6 links" in verdict.notes[0] and verdict.baseline["mass.elbow_joint"].unit == "kg"
+    assert set(result.inertias) and result.inertias["wrist_3_joint"].mass > 0
+
+
+@pytest.mark.slow
+def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
+    """Freed inertias would hide it: they are asked only where the catalogue leaves much."""
+    hidden = parse_effect("payload@flange:mass=4,com_x=0.02,com_y=0.03,com_z=0.1", ur10)
+    drives = draw_drives(np.random.default_rng(2), ur10)
+    parts = [run_experiment(small_plan(ur10, seed, points=1, trajectory=True), [hidden], seed=seed, drives=drives) for seed in (21, 22)]
+    motions = [s for d in parts for s in d.segments if s.kind == "trajectory"]
+    roles = ("identification", "validation")
+    data = replace(parts[0], segments=tuple(replace(s, name=f"m{i}", role=r) for i, (s, r) in enumerate(zip(motions, roles, strict=True))))
+    verdict = diagnose_fully(through_files(data, tmp_path)).verdict
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("payload", "flange")]
+    assert not verdict.notes
