@@ -112,7 +112,7 @@ def test_links_that_are_not_as_described_are_found(moved, ur10):
 
 
 def test_links_as_described_stay_as_they_are(ur10):
-    t, q, tau = rigid_motion(ur10, 3)
+    t, q, _ = rigid_motion(ur10, 3)
     structure = build_structure(ur10)
     still = np.tile(pin.computeGeneralizedGravity(structure.model, structure.model.createData(), q[0]), (len(t), 1))
     rest = Segment(name="m", role="identification", kind="trajectory", t=t, tau=still, q=np.tile(q[:1], (len(t), 1)))
