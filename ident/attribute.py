@@ -36,6 +36,7 @@ DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
+CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain beyond that
 FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched by linear steps alone
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 FINALISTS = 3  # candidates that are fitted to the end
@@ -77,13 +78,15 @@ class Candidate:
 class Round:
     """One round of attribution: what competed, and who won.
 
-    ``before`` is the model without a new cause, its cost under the weights of the candidates.
+    ``before`` is the model without a new cause, its cost under the weights of the candidates; ``explained`` is the
+    share of its excess over noise that the winner explains.
     """
 
     before: Fit
     candidates: tuple[Candidate, ...]
     scores: tuple[Score, ...]
     scale: float
+    explained: float
 
 
 @dataclass(frozen=True)
@@ -162,7 +165,7 @@ def attribute(
             break
         best, before = found.candidates[0], found.before
         fall = (before.cost - best.fit.cost) / found.scale
-        if fall < MIN_EVIDENCE or explained(problem, before, best.fit) < MIN_SHARE:
+        if fall < MIN_EVIDENCE or found.explained < MIN_SHARE:
             break
         if best.hypothesis.decoy:
             unknown = True
@@ -220,7 +223,7 @@ def companions(
     scale = max(1.0, last.cost / last.count)
     joined = reweighted(problem, last, current.weights)
     rounds = [
-        Round(current, (Candidate(s.hypothesis, joined, 0.0, winner.probability),), (s,), scale) for s in kept
+        Round(current, (Candidate(s.hypothesis, joined, 0.0, winner.probability),), (s,), scale, 1.0) for s in kept
     ]
     return last, rounds
 
@@ -297,27 +300,38 @@ def attribute_once(
     A strong cause may have spoilt the model from which others are sought, so that none of them answers;
     candidates are then also sought from a softened model. All are compared under the same weights.
     """
-    before = current
-    if current.chi2_per_dof < HOPELESS:
-        found, scores = explore(problem, current, hypotheses, current.chi2_per_dof > STRONG, workers)
-    else:
-        found, scores = [], []
+    before, softly = current, {}
+    found, scores = explore(problem, current, hypotheses, worth_a_refit(current), workers)
     excess = max(current.cost - current.count, 1.0)
     if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess:
-        before, found, scores = explore_softly(problem, current, found, hypotheses, workers)
+        before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
         if id(h) not in best or result.cost < best[id(h)][1].cost:
             best[id(h)] = h, result
     if not best:
-        return Round(before, (), tuple(scores), 1.0)
+        return Round(before, (), tuple(scores), 1.0, 0.0)
     before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost), workers)
     if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
     rivals, excess = rivals_of_best(problem, before, ranked)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
-    return Round(before, tuple(weighed), tuple(scores), scale)
+    share = max(explained(problem, before, weighed[0].fit), softly.get(id(weighed[0].hypothesis), 0.0))
+    return Round(before, tuple(weighed), tuple(scores), scale, share)
+
+
+def worth_a_refit(current: Fit) -> float:
+    """Share of the excess over noise that a linear step must explain for candidates to be refitted.
+
+    Linear steps understate strong causes, and mean little about a baseline that a strong one has spoilt:
+    there only a clear answer counts.
+    """
+    if current.chi2_per_dof > HOPELESS:
+        return CLEAR_ANSWER
+    if current.chi2_per_dof > STRONG:
+        return 0.0
+    return WORTH_A_REFIT if current.chi2_per_dof > FAINT else WORTH_A_REFIT_FAINT
 
 
 def rivals_of_best(
@@ -347,14 +361,16 @@ def explore_softly(
     direct: Sequence[tuple[Hypothesis, Fit]],
     hypotheses: Sequence[Hypothesis],
     workers: Workers,
-) -> tuple[Fit, list[tuple[Hypothesis, Fit]], list[Score]]:
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]], list[Score], dict[int, float]]:
     """Candidates sought from a softened model, and those found ``direct``, under weights of the former.
 
     Returns:
-        The model without a new cause under these weights, candidates and scores.
+        The model without a new cause under these weights, candidates and scores; and by ``id`` of a hypothesis
+        what it explains under softened weights: of two causes the sharp ones may see the other one alone.
     """
     stage, level = soften(problem, current)
-    found, scores = explore(problem, stage, hypotheses, True, workers, rough=True)
+    found, scores = explore(problem, stage, hypotheses, 0.0, workers, rough=True)
+    softly = {id(h): explained(problem, stage, r) for h, r in found[:FINALISTS]}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
@@ -371,7 +387,7 @@ def explore_softly(
 
     fits = workers.map(sharpened, ways, lambda way: f"finalist: {way[0].effect} at {way[0].place}")
     finalists = [(h, r) for (h, _, _), r in zip(ways, fits, strict=True) if r is not None]
-    return reweighted(problem, current, sharp), finalists, scores
+    return reweighted(problem, current, sharp), finalists, scores, softly
 
 
 def under_noise_of_best(
@@ -407,7 +423,7 @@ def explore(
     problem: Problem,
     stage: Fit,
     hypotheses: Sequence[Hypothesis],
-    regardless: bool,
+    least: float,
     workers: Workers,
     *,
     rough: bool = False,
@@ -415,14 +431,13 @@ def explore(
     """Candidates fitted under the weights of ``stage``, best first, and all scores.
 
     Args:
-        regardless: refit also where no linear step explains much.
+        least: share of the excess over noise that a linear step must explain for any to be refitted.
         rough: the first steps are enough where they answer: the candidates are fitted again.
     """
     preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
-    worth = WORTH_A_REFIT if stage.chi2_per_dof > FAINT else WORTH_A_REFIT_FAINT
-    if not scores or not (regardless or scores[0].gain > worth * excess):
+    if not scores or scores[0].gain < least * excess:
         return [], scores
 
     def started(score: Score) -> Fit | None:

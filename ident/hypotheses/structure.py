@@ -142,6 +142,8 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
             "loop": lambda p: (kernels.LINK, p[0], p[1], p[2]),
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the motor.
             "trivial": lambda p: p[0] < 0.2 * p[1],
+            "absorbs": "gravity_spring",
+            "absorb": lambda p, weights, old: np.array([old[0], p[1], p[2]]),
         },
     )
 
