@@ -307,7 +307,7 @@ def attribute_once(
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
-        if id(h) not in best or result.cost < best[id(h)][1].cost:
+        if not pointless(result.model.effects[-1]) and (id(h) not in best or result.cost < best[id(h)][1].cost):
             best[id(h)] = h, result
     if not best:
         return Round(before, (), tuple(scores), 1.0, 0.0)
@@ -529,7 +529,7 @@ def beside_strong(
     likely = min(ranked, key=lambda x: x[1].cost)[0].joint
     chosen = strong_effects(problem, before, scores, likely)
     fits = workers.map(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
-    strong = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
+    strong = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
     again = {h.key for h, _ in strong}
@@ -612,10 +612,10 @@ def occam(candidate: Candidate, temper: float) -> float:
     keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
     count = int(np.sum(~absent))
     options = effect.hypothesis.options
-    pointless = any(a and q.name == options.get("essential") for q, a in zip(ps, absent, strict=True))
-    pointless = pointless or options.get("trivial", lambda p: False)(effect.p)
+    essential = any(a and q.name == options.get("essential") for q, a in zip(ps, absent, strict=True))
+    nats = POINTLESS_NATS * (essential or pointless(effect))
     if count == 0:
-        return -POINTLESS_NATS * pointless
+        return -nats
     own = np.linalg.inv(_inverse(H[np.ix_(keep, keep)])[-count:, -count:])
     amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in ("sine", "cosine"))) if _wave(ps) else 0.0
     spread = np.array(
@@ -624,7 +624,12 @@ def occam(candidate: Candidate, temper: float) -> float:
     narrowed = np.linalg.slogdet(np.eye(count) + own * np.outer(spread, spread) / temper)[1]
     stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
     density = sum(((v - q.prior_center(stiffness)) / q.spread) ** 2 for q, v in zip(ps, x, strict=True))
-    return float(-0.5 * narrowed - 0.5 * density - POINTLESS_NATS * pointless)
+    return float(-0.5 * narrowed - 0.5 * density - nats)
+
+
+def pointless(effect: Effect) -> bool:
+    """Whether the parameters of an effect leave nothing of it that another one does not hold."""
+    return bool(effect.hypothesis.options.get("trivial", lambda p: False)(effect.p))
 
 
 def _wave(parameters: Sequence[Parameter]) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident.attribute import Attribution, Candidate
+from ident.attribute import Attribution, Candidate, pointless
 from ident.dataset import Dataset
 from ident.extended import Effect, Prediction
 from ident.graybox import INERTIAL, parameter_unit
@@ -186,7 +186,7 @@ def _cause(
         if c not in same and c.probability > 1e-3:
             name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
             others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
-    if h.options.get("trivial", lambda p: False)(effect.p):
+    if pointless(effect):
         trust *= known_probability(1.0, True)
     parameters = reported_parameters(effect, final, covariance)
     numbers = {k: v.value for k, v in parameters.items()}

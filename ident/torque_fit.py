@@ -394,8 +394,10 @@ def fit(
             step[:m] = np.clip(step[:m], -1.0, 1.0)
             step[m + 1 :] = _clip_effects(model, step[m + 1 :])
             step[:m] = np.clip(x[:m] + step[:m], center[:m] - LOG_RANGE, center[:m] + LOG_RANGE) - x[:m]
-            trial = unpack(model, x + step, limit)
             try:
+                if not np.all(np.isfinite(step)):
+                    raise FloatingPointError("a step without a size")
+                trial = unpack(model, x + step, limit)
                 new = predictions(problem, trial, Ws, steps=trial_steps)
                 new_cost = weighted_cost(problem, new, weights)
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):

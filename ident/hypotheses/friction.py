@@ -8,6 +8,7 @@ from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.hypotheses.kernels import bristle, smooth_sign
 from ident.inverse import Motion
 
+ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
 
@@ -43,7 +44,7 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
         "motor",
         (
             Parameter("torque", "N m", 1e-9, 1e7, log=True),
-            Parameter("asymmetry", "1", -0.95, 0.95, null=0.0),
+            Parameter("asymmetry", "1", -0.95, 0.95, center=0.0, spread=ASYMMETRY_SPREAD, null=0.0),
             SMOOTHING,
         ),
         law,
