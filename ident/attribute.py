@@ -158,7 +158,7 @@ def attribute(
     detected = p_value < DETECTION_LEVEL and baseline.chi2_per_dof > DETECTION_EXCESS
     hypotheses = tuple(hypotheses if hypotheses is not None else catalogue(problem.structure))
     current, rounds, unknown, count = baseline, [], False, 0
-    while detected and count < max_causes and current.chi2_per_dof > DETECTION_EXCESS:
+    while detected and count < max_causes and current.chi2_per_dof > DETECTION_EXCESS and not workers.late:
         workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
         found = attribute_once(problem, current, hypotheses, workers)
         if not found.candidates:
@@ -303,7 +303,7 @@ def attribute_once(
     before, softly = current, {}
     found, scores = explore(problem, current, hypotheses, worth_a_refit(current), workers)
     excess = max(current.cost - current.count, 1.0)
-    if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess:
+    if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not workers.late:
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
@@ -312,7 +312,7 @@ def attribute_once(
     if not best:
         return Round(before, (), tuple(scores), 1.0, 0.0)
     before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost), workers)
-    if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count:
+    if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count and not workers.late:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
     rivals, excess = rivals_of_best(problem, before, ranked)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)

@@ -195,6 +195,7 @@ def diagnose(
     dataset: Path,
     out: Out,
     max_causes: Annotated[int, typer.Option(min=0)] = 4,
+    max_seconds: Annotated[float, typer.Option(min=0.0, help="After which no further search for causes begins.")] = 900.0,
     executor: Annotated[
         str, typer.Option(help="Where candidates are fitted: threads, processes, processes:N or dask://HOST:PORT.")
     ] = "threads",
@@ -210,7 +211,7 @@ def diagnose(
     data = load_dataset(dataset)
     _check_out(out)
     with open_executor(executor) as pool, _progress(quiet or json_) as (say, _):
-        result = diagnose_fully(data, max_causes=max_causes, progress=say, executor=pool)
+        result = diagnose_fully(data, max_causes=max_causes, max_seconds=max_seconds, progress=say, executor=pool)
         say("writing report and recording")
         write_outputs(result, out)
     _print(result.verdict.to_dict(), json_, _verdict_text(result.verdict, out))
@@ -383,6 +384,7 @@ def _verdict_text(verdict, out: Path) -> str:
     lines.append(f"Unexplained: {verdict.unexplained_verdict} ({verdict.unexplained_share:.2%})")
     if verdict.residual_description:
         lines.append(verdict.residual_description)
+    lines += verdict.notes
     if verdict.next_experiment:
         lines.append(verdict.next_experiment)
     return "\n".join([*lines, f"Report: {out / 'report.html'}"])

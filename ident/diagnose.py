@@ -43,6 +43,7 @@ MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 SETTLED_BY_INERTIAS = 0.5  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
+MAX_SECONDS = 900.0  # of search for causes
 SEED = 0
 
 
@@ -144,11 +145,14 @@ def diagnose(
     dataset: Dataset,
     *,
     max_causes: int = 4,
+    max_seconds: float = MAX_SECONDS,
     progress: Callable[[str], None] | None = None,
     executor: Executor | None = None,
 ) -> Verdict:
     """Find what the simulation gets wrong; the verdict alone (see ``diagnose_fully``)."""
-    return diagnose_fully(dataset, max_causes=max_causes, progress=progress, executor=executor).verdict
+    return diagnose_fully(
+        dataset, max_causes=max_causes, max_seconds=max_seconds, progress=progress, executor=executor
+    ).verdict
 
 
 @one_thread_each
@@ -156,6 +160,7 @@ def diagnose_fully(
     dataset: Dataset,
     *,
     max_causes: int = 4,
+    max_seconds: float = MAX_SECONDS,
     progress: Callable[[str], None] | None = None,
     executor: Executor | None = None,
 ) -> Diagnosis:
@@ -163,19 +168,21 @@ def diagnose_fully(
 
     Args:
         max_causes: rounds of attribution at most.
+        max_seconds: after which no further search for causes is begun; what was found by then is fitted,
+            and the verdict says so. Results are reproducible where it is not reached.
         progress: told in a line what is done.
         executor: of ``concurrent.futures``, for the fits of candidates; threads, one per core, where
             None. Results are the same.
     """
     began = time.perf_counter()
-    workers = Workers(executor, progress)
+    workers = Workers(executor, progress, time.monotonic() + max_seconds)
     say = workers.say
     setup, baseline = identify(dataset, progress=say)
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     rigid = None
-    if unresolved(result) and all(g.window is not None for g in setup.problem.groups):
+    if unresolved(result) and not workers.late and all(g.window is not None for g in setup.problem.groups):
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
-    problem = setup.problem
+    problem, cut = setup.problem, workers.late
     say("gain on held-out data")
     before, after = baseline.model, result.final.model
     first = predictions(problem, before, baseline.remainders)
@@ -195,6 +202,9 @@ def diagnose_fully(
     late = find_link_delays(problem, last)
     separating = separating_experiment(problem, result)
     verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
+    if cut:
+        note = f"The search for causes ended after {max_seconds:g} s: with more time more may be found."
+        verdict = replace(verdict, notes=(*verdict.notes, note))
     kept = result.rounds if len(verdict.causes) else ()
     return Diagnosis(
         verdict=verdict,

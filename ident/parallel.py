@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -72,10 +74,16 @@ class Workers:
     Attributes:
         executor: any of ``concurrent.futures``; threads of this process, one per core, where None.
         progress: told of every piece of work in a line.
+        deadline: of ``time.monotonic``, after which no search is begun that can be left out.
     """
 
     executor: Executor | None = None
     progress: Callable[[str], None] | None = None
+    deadline: float = math.inf
+
+    @property
+    def late(self) -> bool:
+        return time.monotonic() > self.deadline
 
     def say(self, text: str) -> None:
         if self.progress is not None:

@@ -176,10 +176,11 @@ def evidence_plot(
             "time": lambda m=motion: m.time,
             "torque": lambda m=motion, j=j: m.torque(j),
         }.get(h.variable, lambda c=curves: c[1])()
+        # A motion is closed by a return that nobody recorded.
+        recorded = slice(None) if group.window is None else group.window > 0.5
         step = max(1, variable.size // (1500 // max(len(problem.groups), 1) + 1))
-        xs.append(variable.ravel()[::step])
-        ys.append(curves[0].ravel()[::step])
-        ms.append(curves[1].ravel()[::step])
+        for store, signal in ((xs, variable), (ys, curves[0]), (ms, curves[1])):
+            store.append(signal[:, recorded].ravel()[::step])
     x, y, m = (np.concatenate(v) for v in (xs, ys, ms))
     order = np.argsort(x)
     label = LABELS.get(h.variable, "fitted effect, N m")

@@ -78,9 +78,11 @@ def collapsed(problem: Problem, final: Fit) -> bool:
     drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
     known = np.sqrt(np.maximum(np.diag(final.covariance())[drives], 0.0)) < UNDETERMINED
     limit = np.log(IMPLAUSIBLE)
-    # A gear stiffer than the data can see ends anywhere above, and motions hardly show a small motor beside its link.
+    # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
+    # its link: there the gears take up what else is wrong, and only a motor that is known tells.
     low = x[drives] < -limit
     if all(group.window is not None for group in problem.groups):
+        known[:n] = False
         low &= known
     return final.chi2_per_dof > LEFT_ERROR and bool(np.any(low | (known & (x[drives] > limit))))
 

@@ -47,6 +47,14 @@ def test_a_dask_cluster_gives_the_same_verdict_bit_for_bit(friction):
             assert verdict_of(friction[0], executor=executor) == friction[1]
 
 
+def test_a_search_without_time_says_so_and_names_nothing(friction):
+    verdict = diagnose(friction[0], max_seconds=0.0)
+    assert verdict.discrepancy.detected and not verdict.causes
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    assert "ended after 0 s" in verdict.notes[0]
+    assert json.loads(friction[1])["notes"] == []
+
+
 @pytest.mark.parametrize("text", ["", "cores", "processes:0", "processes:two", "dask://", "dask:host", "threads:2"])
 def test_an_executor_that_is_none_is_refused(text):
     with pytest.raises(DataError, match="--executor"):

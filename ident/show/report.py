@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
+from ident.graybox import INERTIAL, parameter_unit
 from ident.show.figures import (
     evidence_figure,
     frf_figure,
@@ -33,6 +34,8 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         d=diagnosis,
         v=diagnosis.verdict,
         kinds=KINDS,
+        inertial=(*INERTIAL, "torque_offset"),
+        unit=parameter_unit,
         rounded=rounded,
         unit_suffix=unit_suffix,
         table=parameter_table(diagnosis.verdict.baseline),
