@@ -13,6 +13,7 @@ import numpy as np
 
 NAMED = 0.5  # probability above which a cause counts as named
 TIED = 0.2  # probability above which an alternative counts as tied with the first
+SEEN = 3.0  # distortion over noise from which an effect counts as one that the data show
 BINS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97, 1.0001])
 
 
@@ -80,6 +81,10 @@ def table(rows: list[dict]) -> str:
                 f"{name:8s} {n:4d}: exactly right {right}, right or tied {within}, at least one right {some},"
                 f" a wrong name {wrong}, no name {silent}"
             )
+    shown = [r for r in by_kind.get("one", []) if r["truth"][0].get("size", np.inf) >= SEEN]
+    if len(shown) < len(by_kind.get("one", [])):
+        right = sum(named(r) == truth_of(r) for r in shown)
+        out.append(f"one, of at least {SEEN:g} times the noise: exactly right {right} of {len(shown)}")
     errors = [e for r in rows for e in r.get("judged", {}).get("errors", [])]
     closed = [r["gain"]["gap_closed"] for r in rows if kind(r) in ("one", "two") and (r.get("gain") or {}).get("gap_closed")]
     seconds = [r["diagnosed_s"] for r in rows if "diagnosed_s" in r]
@@ -132,10 +137,10 @@ def _detection(ax, rows: list[dict]) -> None:
                 continue
             state = "right" if named(row) == truth_of(row) else ("wrong" if named(row) - truth_of(row) else "no name")
             if state == label:
-                x.append(np.sqrt(max(row["chi2"] - 1.0, 1e-3)))
+                x.append(max(row["truth"][0]["size"], 1e-2))
                 y.append(max((c["probability"] for c in row["causes"]), default=0.0))
         ax.semilogx(x, y, marker, color=color, label=label, alpha=0.7)
-    ax.set_xlabel("distortion over noise: sqrt(chi² per degree of freedom - 1)")
+    ax.set_xlabel("distortion over noise")
     ax.set_ylabel("probability of the first name")
     ax.set_ylim(-0.03, 1.03)
     ax.grid(alpha=0.3)
