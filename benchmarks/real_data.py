@@ -26,7 +26,10 @@ PAGE = Path(__file__).parent.parent / "docs" / "real-data.md"
 
 @dataclass(frozen=True)
 class Machine:
-    """A data set: folder (also the name of its map), robot, raw files (all where empty), and what is known of it."""
+    """A data set: folder (also the name of its map), robot, raw files (all where empty), and what is known of it.
+
+    ``picture``: whether its licence lets a picture of the recording be shown here.
+    """
 
     folder: str
     robot: str
@@ -34,6 +37,7 @@ class Machine:
     title: str
     known: str
     max_causes: int = 3
+    picture: bool = True
 
 
 MACHINES = (
@@ -82,6 +86,7 @@ MACHINES = (
         " 0.33 N m on this run, sensor offsets of up to 0.4 N m in it; base parameters and friction fitted to the run itself leave 0.05 to"
         " 0.14 N m (the whole band). Friction on the side of the sensor, with loops before it slips.",
         1,
+        picture=False,
     ),
     Machine(
         "staubli_tx40",
@@ -122,7 +127,7 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
         lines += [f"Torque error on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} N m{closed}; noise {g.noise_floor:.2g}.", ""]
     if v.residual_description:
         lines += [v.residual_description, ""]
-    for trace in result.traces[:1]:
+    for trace in result.traces[: int(machine.picture)]:
         picture = PAGE.parent / f"{machine.folder}.svg"
         picture.write_text(trace_figure(trace, result.joints), encoding="utf-8")
         lines += [f"![Error of the torque on held-out motion, before and after]({picture.name})", ""]
