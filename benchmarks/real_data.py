@@ -21,6 +21,9 @@ from ident.diagnose import diagnose_fully
 from ident.show.figures import trace_figure
 from ident.verdict import Diagnosis
 
+COLOURS = (
+    "<style>svg { --ink: #16181a; --soft: #5c666f; --line: #dfe3e6; --before: #c0492f; --after: #1f6f8b; background: #ffffff }</style>"
+)
 PAGE = Path(__file__).parent.parent / "docs" / "real-data.md"
 
 
@@ -129,7 +132,9 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
         lines += [v.residual_description, ""]
     for trace in result.traces[: int(machine.picture)]:
         picture = PAGE.parent / f"{machine.folder}.svg"
-        picture.write_text(trace_figure(trace, result.joints), encoding="utf-8")
+        # The figures of the report take their colours from its page.
+        svg = trace_figure(trace, result.joints).replace('version="1.1">', f'version="1.1">{COLOURS}', 1)
+        picture.write_text(svg, encoding="utf-8")
         lines += [f"![Error of the torque on held-out motion, before and after]({picture.name})", ""]
     lines += [f"{seconds:.0f} s with `--max-causes {machine.max_causes}`.", ""]
     return "\n".join(lines)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ident.checking import inspect_dataset
 from ident.convert import convert_logs
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
@@ -69,3 +70,50 @@ def test_time_stamps_are_resampled_on_a_uniform_grid(tmp_path):
     s = convert_logs([tmp_path / "log.csv"], "twomass", tmp_path / "map.toml").segments[0]
     assert np.allclose(np.diff(s.t), 1 / 200) and np.abs(s.q[:, 0] - s.t).max() < 1e-9
     assert np.abs(s.tau[:, 0] - np.sin(s.t)).max() < 1e-3
+
+
+def named(verdict):
+    return {(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("folder", "robot", "files", "max_causes", "left"),
+    [
+        ("emps_drive", "emps", ["DATA_EMPS.mat"], 2, 0.25),
+        ("kuka_kr300_dual_encoder", "kr300", None, 2, 0.45),
+        ("ur10_unisa", "ur10_bare", None, 3, 0.3),
+        ("panda_gaz_ral2019", "panda_bare", [f"exciting_traj_{x}.txt" for x in ("positions", "time", "torques", "velocity")], 1, 0.5),
+        ("staubli_tx40", "tx40", None, 1, 0.9),
+    ],
+)
+def test_real_motions_get_causes_that_their_publishers_know(folder, robot, files, max_causes, left, tmp_path):
+    """From the logs to the verdict; ``left`` is the held-out error of the extended model over that of the first."""
+    raw = DATA.parent / folder / "raw"
+    if not raw.is_dir():
+        pytest.skip(f"the real data of {folder} are not here")
+    logs = sorted(p for p in raw.iterdir() if p.is_file()) if files is None else [raw / f for f in files]
+    data = convert_logs(logs, robot, folder)
+    save_dataset(data, tmp_path / "d")
+    data = load_dataset(tmp_path / "d")
+    assert inspect_dataset(data).joints == data.joints
+    verdict = diagnose_fully(data, max_causes=max_causes).verdict
+    assert verdict.gain.after < left * verdict.gain.before
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    frictions = {"coulomb_friction", "presliding_friction", "stribeck_friction"}
+    rubbing = {j for e, j in named(verdict) if e in frictions}
+    others = {(e, j) for e, j in named(verdict) if e not in frictions}
+    if folder == "emps_drive":
+        torque = next(c for c in verdict.causes if c.effect == "coulomb_friction").parameters["torque"].value
+        assert rubbing == {"screw"} and torque == pytest.approx(20.39, rel=0.1)
+    if folder == "kuka_kr300_dual_encoder":
+        late = {c.joint: c.parameters["delay"].value for c in verdict.causes if c.effect == "sensor_delay"}
+        assert all(late[j] == pytest.approx(3e-3, abs=0.2e-3) for j in ("axis_2", "axis_3"))
+        assert ("gravity_spring", "axis_2") in others
+        assert others <= {("gravity_spring", "axis_2"), *(("sensor_delay", f"axis_{j}") for j in (1, 2, 3))}
+    else:
+        assert not others
+    if folder == "ur10_unisa":
+        assert len(rubbing) >= 4
+    if folder == "panda_gaz_ral2019":
+        assert rubbing and "mass.panda_joint4" in verdict.baseline
