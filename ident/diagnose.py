@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.attribute import Attribution, attribute, fit_baseline
 from ident.conclude import baseline_values, conclude, named_effects
-from ident.dataset import Dataset
+from ident.dataset import Dataset, Segment
 from ident.extended import Effect, predict
 from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import (
@@ -32,17 +32,21 @@ from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, fit_rigid
-from ident.torque_fit import Fit, Problem, fit, predictions
+from ident.torque_fit import Fit, Problem, data_count, fit, predictions
 from ident.trust import (
     LEFT_ERROR,
 )
 from ident.verdict import Diagnosis, Gain, Verdict
+from robot_assets.errors import DataError
 
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
 MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 SETTLED_BY_INERTIAS = 0.5  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
+MOVES = 3.0  # standard deviation of a position over its noise
+HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
+LEAST_HELD_OUT = 2.0  # s of it
 MAX_SECONDS = 900.0  # of search for causes
 SEED = 0
 
@@ -60,7 +64,7 @@ def set_up(dataset: Dataset) -> Setup:
     """Records, structure and starting guesses of a dataset.
 
     Raises:
-        DataError: where nothing is left for identification.
+        DataError: where nothing is left for identification, no joint moves, or there is less to compare than to fit.
     """
     robot = dataset.robot
     nominal, structure = Parameters.nominal(robot), build_structure(robot)
@@ -84,7 +88,36 @@ def set_up(dataset: Dataset) -> Setup:
         q_std,
         step_std=step_std,
     )
+    if data_count(problem) <= len(nominal.to_log()):
+        found = f"{data_count(problem)} numbers to compare"
+        raise DataError("segments", dataset.name, found, f"more than the {len(nominal.to_log())} parameters: longer records")
+    if not moves(dataset, q_std):
+        raise DataError("positions", dataset.name, "no joint that moves beyond its noise", "motion that the drives bring about")
     return Setup(problem, held_out, steps)
+
+
+def moves(dataset: Dataset, q_std: np.ndarray) -> bool:
+    """Whether any joint moves beyond the noise of its position (n,) in any segment."""
+    return any(np.any(np.std(s.q, axis=0) > MOVES * q_std) for s in dataset.segments)
+
+
+def with_held_out(dataset: Dataset) -> Dataset:
+    """The dataset, its end held out where it is a single motion: nothing else would test what is named."""
+    if len(dataset.segments) != 1 or dataset.segments[0].kind != "trajectory":
+        return dataset
+    whole = dataset.segments[0]
+    cut = round((1.0 - HELD_OUT_SHARE) * whole.n_samples)
+    if (whole.n_samples - cut) / dataset.sample_rate < LEAST_HELD_OUT:
+        return dataset
+
+    def part(rows: slice, name: str, role: str) -> Segment:
+        channels = {
+            c: getattr(whole, c)[rows] for c in ("t", "tau", "q", "qd", "r", "q_ref", "q_link", "temp") if getattr(whole, c) is not None
+        }
+        return replace(whole, name=name, role=role, **channels)
+
+    ends = part(slice(None, cut), whole.name, "identification"), part(slice(cut, None), f"{whole.name}-end", "validation")
+    return replace(dataset, segments=ends)
 
 
 def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) -> float:
@@ -124,7 +157,11 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
 def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:
     """Baseline parameters by maximum likelihood on the torque residual."""
     setup = set_up(dataset)
-    result = fit_baseline(setup.problem, progress)
+    try:
+        result = fit_baseline(setup.problem, progress)
+    except FloatingPointError as err:
+        found = "motions along which the links of the model cannot be solved"
+        raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
     return replace(setup, problem=with_measured_noise(setup.problem, result)), result
 
 
@@ -177,6 +214,7 @@ def diagnose_fully(
     began = time.perf_counter()
     workers = Workers(executor, progress, time.monotonic() + max_seconds)
     say = workers.say
+    given, dataset = dataset, with_held_out(dataset)
     setup, baseline = identify(dataset, progress=say)
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     rigid = None
@@ -189,9 +227,8 @@ def diagnose_fully(
     affected = affected_joints(problem, baseline, first) if result.detected else ()
     if setup.held_out:
         errors, pairs = segment_errors(problem, setup.held_out, before, after)
-        gain = measure_gain(
-            errors, dataset.joints, affected, "validation segments", np.random.default_rng(SEED)
-        )
+        method = "validation segments" if dataset is given else "the end of the only motion, held out"
+        gain = measure_gain(errors, dataset.joints, affected, method, np.random.default_rng(SEED))
         shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
     else:
         gain = leave_one_out(setup, baseline, result, rigid is not None, affected, workers)

@@ -266,3 +266,34 @@ def test_notes_beside_a_dataset_are_not_lost(folder):
     assert (folder / "notes.txt").read_text() == "cold morning"
     (folder / "notes.txt").unlink()
     assert outcome(save_dataset, data, folder) is None
+
+
+def bare_motion(robot, q, tau):
+    t = np.arange(len(q)) / 250.0
+    segment = Segment(name="m", kind="trajectory", role="identification", t=t, tau=tau, q=q)
+    return Dataset("poor", robot.name, robot, 250.0, robot.joint_names, "none", None, None, None, (segment,))
+
+
+@pytest.mark.parametrize("name", ["twomass", "ur10"])
+@pytest.mark.parametrize("kind", ["short", "zeros", "still", "noise"])
+def test_a_log_that_can_decide_nothing_is_one_line(name, kind):
+    from ident.diagnose import diagnose
+
+    robot, rng = load_robot(name), np.random.default_rng(0)
+    N = 60 if kind == "short" else 1500
+    wave = np.sin(np.arange(N) / 80.0)[:, None] * np.ones(robot.n)
+    noise = rng.normal(size=(2, N, robot.n))
+    q, tau = {
+        "short": (wave, 5 * wave),
+        "zeros": (0 * wave, 0 * wave),
+        "still": (1e-6 * noise[0], noise[1]),
+        "noise": (noise[0], noise[1]),
+    }[kind]
+    assert outcome(diagnose, bare_motion(robot, q, tau)) is not None
+
+
+def test_positions_in_a_unit_that_cannot_be_are_one_line(ur10):
+    from ident.diagnose import diagnose
+
+    wave = np.sin(np.arange(1500) / 80.0)[:, None] * np.ones(6)
+    assert "positions" in outcome(diagnose, bare_motion(ur10, 1e6 * wave, wave))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.dataset import Dataset, Segment
-from ident.diagnose import diagnose_fully, set_up
+from ident.diagnose import diagnose_fully, set_up, with_held_out
 from ident.graybox import LinkChange, Parameters, build_structure
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, fit_rigid, regressor
@@ -112,14 +112,32 @@ def test_links_that_are_not_as_described_are_found(moved, ur10):
 
 
 def test_links_as_described_stay_as_they_are(ur10):
+    """Where one joint moves alone the rest of the arm is not shown."""
     t, q, _ = rigid_motion(ur10, 3)
-    structure = build_structure(ur10)
-    still = np.tile(pin.computeGeneralizedGravity(structure.model, structure.model.createData(), q[0]), (len(t), 1))
-    rest = Segment(name="m", role="identification", kind="trajectory", t=t, tau=still, q=np.tile(q[:1], (len(t), 1)))
-    problem = set_up(dataset_of(ur10, rest)).problem
+    q = np.tile(q[:1], (len(t), 1))
+    q[:, 0] += 0.3 * np.sin(t)
+    acc = np.zeros_like(q)
+    acc[:, 0] = -0.3 * np.sin(t)
+    v = np.zeros_like(q)
+    v[:, 0] = 0.3 * np.cos(t)
+    structure, par = build_structure(ur10), Parameters.nominal(ur10)
+    data = structure.model.createData()
+    tau = np.array([pin.rnea(structure.model, data, *x) for x in zip(q, v, acc, strict=True)]) + par.inertia * acc + par.viscous * v
+    problem = set_up(dataset_of(ur10, Segment(name="m", role="identification", kind="trajectory", t=t, tau=tau, q=q))).problem
     found = fit_rigid(problem.structure, problem.nominal, problem.groups)
     for i in range(1, 7):
         assert found.structure.model.inertias[i].mass == pytest.approx(structure.model.inertias[i].mass, rel=0.05)
+
+
+def test_the_end_of_a_single_motion_is_held_out(ur10):
+    t, q, tau = rigid_motion(ur10, 4)
+    one = dataset_of(ur10, Segment(name="m", role="identification", kind="trajectory", t=t, tau=tau, q=q))
+    first, end = with_held_out(one).segments
+    assert (first.role, end.role) == ("identification", "validation")
+    assert np.array_equal(np.concatenate([first.q, end.q]), q) and np.array_equal(np.concatenate([first.t, end.t]), t)
+    assert end.n_samples == pytest.approx(len(t) / 3, abs=1)
+    short = dataset_of(ur10, Segment(name="m", role="identification", kind="trajectory", t=t[:900], tau=tau[:900], q=q[:900]))
+    assert with_held_out(short) is short
 
 
 def test_friction_is_named_beside_links_that_differ_from_their_description(moved, tmp_path):

@@ -8,6 +8,7 @@ from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.hypotheses.kernels import bristle, smooth_sign
 from ident.inverse import Motion
 
+LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
@@ -120,7 +121,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
         ),
         law,
-        lambda scale: [(f * scale.q,) for f in (0.01, 0.03, 0.1, 0.3, 1.0)],
+        lambda scale: [(f * max(scale.q, LEAST_MOTION),) for f in (0.01, 0.03, 0.1, 0.3, 1.0)],
         screen,
         "The residual torque of {joint} makes loops in position: friction that yields as a spring of"
         " {stiffness:.3g} N m/rad before it slips at {coulomb:.3g} N m.",
