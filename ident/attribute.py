@@ -60,7 +60,7 @@ DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
 RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
-WORTH_A_REFIT = 0.05  # the same for a screened gain: linear steps understate strong effects
+WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: linear steps understate strong effects
 WORTH_A_REFIT_FAINT = 0.1  # the same where what is left is faint
 
 
@@ -342,6 +342,7 @@ def rivals_of_best(
     A real arm has causes at every joint: one that explains another joint is no alternative, and what is left
     there is no error of this one. A change of the chain is seen at every joint.
     """
+    ranked = sorted(ranked, key=lambda x: x[1].cost)
     best, top = ranked[0]
     costs = [
         joint_costs(problem, predictions(problem, r.model, r.remainders), r.weights) for r in (before, *(r for _, r in ranked))

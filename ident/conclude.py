@@ -133,7 +133,7 @@ def inertia_values(rigid: RigidFit) -> dict[str, Value]:
     out = {}
     for body, std in zip(rigid.bodies, rigid.std, strict=True):
         model = rigid.structure.model
-        p = model.inertias[model.getJointId(body)].toDynamicParameters()
+        p = model.inertias[rigid.structure.carriers[body]].toDynamicParameters()
         for kind, v, s in zip(INERTIAL, p, std, strict=True):
             name = f"{kind}.{body}"
             out[name] = Value(float(v), float(s), parameter_unit(name))

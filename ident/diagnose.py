@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.attribute import Attribution, attribute, fit_baseline
+from ident.attribute import NOT_COMPUTED, Attribution, attribute, fit_baseline
 from ident.conclude import baseline_values, conclude, named_effects
 from ident.dataset import Dataset, Segment
 from ident.extended import Effect, predict
@@ -217,7 +217,7 @@ def diagnose_fully(
     given, dataset = dataset, with_held_out(dataset)
     setup, baseline = identify(dataset, progress=say)
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
-    rigid = None
+    nominal, rigid = setup.problem.nominal, None
     if unresolved(result) and not workers.late and all(g.window is not None for g in setup.problem.groups):
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
     problem, cut = setup.problem, workers.late
@@ -231,7 +231,7 @@ def diagnose_fully(
         gain = measure_gain(errors, dataset.joints, affected, method, np.random.default_rng(SEED))
         shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
     else:
-        gain = leave_one_out(setup, baseline, result, rigid is not None, affected, workers)
+        gain = leave_one_out(setup, nominal, baseline, result, rigid is not None, affected, workers)
         shown = problem.groups[:1]
         pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
     say("evidence")
@@ -240,9 +240,8 @@ def diagnose_fully(
     separating = separating_experiment(problem, result)
     verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
     if cut:
-        note = f"The search for causes ended after {max_seconds:g} s: with more time more may be found."
+        note = f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found."
         verdict = replace(verdict, notes=(*verdict.notes, note))
-    kept = result.rounds if len(verdict.causes) else ()
     return Diagnosis(
         verdict=verdict,
         robot=dataset.robot,
@@ -251,7 +250,7 @@ def diagnose_fully(
         spectrum=spectrum_map(problem, baseline, first, last),
         evidence=tuple(
             evidence_plot(problem, result.final, last, effect, i)
-            for i, (effect, _) in enumerate(zip(named_effects(result.final), kept, strict=False))
+            for i, effect in enumerate(named_effects(result.final))
         ),
         traces=torque_traces(dataset, shown, pairs),
         parameters={k: v.value for k, v in baseline_values(result.final)[0].items()},
@@ -280,10 +279,13 @@ def with_inertias(
     """
     workers.say("inertias of the links")
     problem = setup.problem
-    rigid = fit_rigid(problem.structure, problem.nominal, problem.groups)
-    problem = replace(problem, structure=rigid.structure, nominal=rigid.par)
-    offsets = tuple(Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names))
-    baseline = fit_baseline(problem, workers.say, offsets)
+    try:
+        rigid = fit_rigid(problem.structure, problem.nominal, problem.groups)
+        problem = replace(problem, structure=rigid.structure, nominal=rigid.par)
+        offsets = tuple(Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names))
+        baseline = fit_baseline(problem, workers.say, offsets)
+    except NOT_COMPUTED:
+        return setup, result, None
     other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
     if other.final.chi2_per_dof > SETTLED_BY_INERTIAS * result.final.chi2_per_dof:
         return setup, result, None
@@ -292,6 +294,7 @@ def with_inertias(
 
 def leave_one_out(
     setup: Setup,
+    nominal: Parameters,
     baseline: Fit,
     result: Attribution,
     renewed: bool,
@@ -301,6 +304,8 @@ def leave_one_out(
     """Gain by leaving out one operating point after another, both models refitted without it.
 
     Args:
+        nominal: starting guesses of the drives.
+        baseline: the first model.
         renewed: whether the inertias of the links were found too.
     """
     problem = setup.problem
@@ -308,15 +313,15 @@ def leave_one_out(
         return None
 
     def without(i: int) -> Errors:
-        part = replace(problem, groups=tuple(g for k, g in enumerate(problem.groups) if k != i))
+        part = replace(problem, nominal=nominal, groups=tuple(g for k, g in enumerate(problem.groups) if k != i))
         models = []
         for start in (baseline, result.final):
             remainders = [W for k, W in enumerate(start.remainders) if k != i]
-            model = start.model
+            model, of = start.model, part
             if renewed and start is result.final:
-                links = fit_rigid(build_structure(problem.structure.robot), problem.nominal, part.groups)
-                model = replace(model, structure=links.structure)
-            models.append(fit(part, model, iterations=4, remainders=remainders).model)
+                links = fit_rigid(build_structure(problem.structure.robot), nominal, part.groups)
+                model, of = replace(model, structure=links.structure), replace(part, nominal=links.par)
+            models.append(fit(of, model, iterations=4, remainders=remainders).model)
         return segment_errors(problem, problem.groups[i : i + 1], *models)[0]
 
     errors = workers.map(without, range(len(problem.groups)))

@@ -57,6 +57,7 @@ class Structure:
         driven: (n,) index of each driven joint among the link coordinates.
         elastic: (n_e,) indices of the elastic hinges.
         bodies: link name -> (Pinocchio joint index, placement of the link frame in it).
+        carriers: joint of the description -> index of the joint that carries its body, behind its hinges.
         robot: the robot it was built from.
         hinges, loads, links, inertias: what ``build_structure`` was given beyond the robot.
     """
@@ -70,6 +71,7 @@ class Structure:
     loads: tuple[tuple[str, pin.Inertia], ...] = ()
     links: dict[str, LinkChange] = field(default_factory=dict)
     inertias: dict[str, pin.Inertia] = field(default_factory=dict)
+    carriers: dict[str, int] = field(default_factory=dict)
 
     @property
     def n(self) -> int:
@@ -196,7 +198,7 @@ def build_structure(
         elasticities: elastic hinges beyond those of the robot.
         loads: (link name, inertia in that link's frame) beyond those of the robot.
         links: link name -> how its body differs from its description.
-        inertias: joint of the chain -> inertia of the body on it, loads of the robot included, instead
+        inertias: joint of the description -> inertia of the body on it, loads of the robot included, instead
             of what the description says.
 
     Raises:
@@ -220,7 +222,7 @@ def build_structure(
         )
         index[name] = model.idx_vs[k]
         carrier[i] = _add_hinges(model, k, name, hinges, pin.SE3.Identity())
-        body = changed.get(i, LinkChange()).of(known.get(model.names[carrier[i]], source.inertias[i]))
+        body = changed.get(i, LinkChange()).of(known.get(name, source.inertias[i]))
         model.appendBodyToJoint(carrier[i], body, pin.SE3.Identity())
     bodies = {
         f.name: (carrier[f.parentJoint], f.placement)
@@ -235,7 +237,7 @@ def build_structure(
         if link not in bodies:
             raise DataError("load", str(robot.folder), link, f"a link among {sorted(bodies)}")
         joint_index, placement = bodies[link]
-        if k < len(own) and model.names[joint_index] in known:
+        if k < len(own) and source.names[parent[link]] in known:
             continue
         model.appendBodyToJoint(joint_index, inertia, placement)
     driven = np.array([index[name] for name in robot.joint_names])
@@ -243,7 +245,16 @@ def build_structure(
         [model.idx_vs[model.getJointId(_hinge_name(h))] for h in hinges], dtype=int
     )
     return Structure(
-        model, driven, elastic, bodies, robot, tuple(elasticities), tuple(loads), dict(links or {}), dict(known)
+        model,
+        driven,
+        elastic,
+        bodies,
+        robot,
+        tuple(elasticities),
+        tuple(loads),
+        dict(links or {}),
+        dict(known),
+        {source.names[i]: k for i, k in carrier.items() if i},
     )
 
 

@@ -45,8 +45,8 @@ class RigidFit:
         structure: the chain with the inertias found.
         par: starting parameters with the motor inertia and viscous friction found.
         std: (bodies, 10) of the inertial parameters, in the order of ``pin.Inertia.toDynamicParameters``.
-        bodies: names of the bodies' joints in the chain.
-        rank: base parameters that the motions show, of all 10 per body.
+        bodies: joints of the description that carry the bodies.
+        rank: combinations that the motions show, of the 10 parameters of each body, motor inertias and viscous frictions.
         left: (n,) rms torque that is left in the band, N m.
     """
 
@@ -62,11 +62,12 @@ def fit_rigid(structure: Structure, nominal: Parameters, groups: Sequence[Group]
     """Inertias of all links, motor inertia and friction from motions.
 
     Args:
-        structure: the chain as described; elastic hinges are held at rest.
+        structure: the chain as described, without loads or changes of links; elastic hinges are held at rest.
         nominal: starting guesses of the drives.
         groups: motions.
     """
-    indices = [i for i in range(1, structure.model.njoints) if structure.model.inertias[i].mass > 0]
+    bodies = {n: i for n, i in structure.carriers.items() if structure.model.inertias[i].mass > 0}
+    names, indices = tuple(bodies), list(bodies.values())
     described = np.array([structure.model.inertias[i].toDynamicParameters() for i in indices])
     roots = np.array([_root(p) for p in described])
     parts = [_rows(structure, nominal.coupling, group, indices) for group in groups]
@@ -80,7 +81,7 @@ def fit_rigid(structure: Structure, nominal: Parameters, groups: Sequence[Group]
         problem = _Weighted.build(y, Y, a, v, friction, np.maximum(scale, 1e-9))
         x, H = _minimise(problem, roots, x, center, prior)
         scale = np.sqrt(np.mean(problem.left(_model(roots, x, n)) ** 2, axis=0)) * scale
-    power = sum(float(np.mean(group.window**2)) for group in groups)
+    power = sum(group.period_time * float(np.mean(group.window**2)) for group in groups)
     rms = scale * np.sqrt(len(y) / power)
     pi, dpi = _inertias(roots, x[: COORDINATES * B])
     covariance = np.linalg.inv(H + np.diag(prior))
@@ -92,12 +93,9 @@ def fit_rigid(structure: Structure, nominal: Parameters, groups: Sequence[Group]
             ]
         )
     )
-    names = tuple(structure.model.names[i] for i in indices)
     changed = build_structure(
         structure.robot,
         elasticities=structure.hinges,
-        loads=structure.loads,
-        links=structure.links,
         inertias={name: pin.Inertia.FromDynamicParameters(p) for name, p in zip(names, pi, strict=True)},
     )
     par = replace(
@@ -134,8 +132,8 @@ def _rows(
     coarse = replace(coarse, window=window)
 
     def seen(X: np.ndarray) -> np.ndarray:
-        """Lines as rows of real numbers whose squares sum to the mean square of the signal."""
-        X = coarse.observe(X)
+        """Lines as rows of real numbers whose squares sum to the energy of the signal."""
+        X = np.sqrt(group.period_time) * coarse.observe(X)  # lines of a long motion hold less noise
         X[1:] *= np.sqrt(2.0)
         return np.concatenate([X.real, X.imag[1:]])
 
@@ -230,14 +228,12 @@ def _model(roots: np.ndarray, x: np.ndarray, n: int) -> tuple[np.ndarray, np.nda
 class _Weighted:
     """Normal equations of the torque in the parameters that it is linear in; friction is eliminated.
 
-    ``R`` (m, m) and ``z`` (m,): ``|y - X p|^2 = |z - R p|^2 + rest``. ``y``, ``X`` are as weighted.
+    ``|y - X p|^2 = |y|^2 - 2 p^T z + p^T gram p`` with ``gram`` (m, m) and ``z`` (m,). ``y``, ``X`` are as weighted.
     """
 
-    R: np.ndarray
     z: np.ndarray
     y: np.ndarray
     X: np.ndarray
-    friction: np.ndarray
     gram: np.ndarray
 
     @classmethod
@@ -253,7 +249,7 @@ class _Weighted:
         y = y - np.einsum("tjc,ujc,uj->tj", Q, Q, y, optimize=True)
         flat = X.reshape(-1, X.shape[-1])
         gram = flat.T @ flat
-        return cls(gram, flat.T @ y.ravel(), y, X, Q, gram)
+        return cls(flat.T @ y.ravel(), y, X, gram)
 
     def left(self, model: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """(R, n) weighted residual at a model."""
@@ -275,14 +271,14 @@ def _minimise(
 
     def cost(x: np.ndarray) -> float:
         p = _model(roots, x, n)[0]
-        fit = power - 2 * p @ problem.z + p @ problem.R @ p
+        fit = power - 2 * p @ problem.z + p @ problem.gram @ p
         return float(fit + np.sum(prior * (x - center) ** 2))
 
     now, damping = cost(x), 1e-3
     for _ in range(STEPS):
         p, dp = _model(roots, x, n)
-        H = dp.T @ problem.R @ dp
-        b = dp.T @ (problem.z - problem.R @ p) - prior * (x - center)
+        H = dp.T @ problem.gram @ dp
+        b = dp.T @ (problem.z - problem.gram @ p) - prior * (x - center)
         for _ in range(8):
             step = np.linalg.solve(H + np.diag(prior) + damping * np.diag(np.diag(H) + prior), b)
             new = cost(x + np.clip(step, -1.0, 1.0))
@@ -296,4 +292,4 @@ def _minimise(
         if gain < 1e-6 * now:
             break
     dp = _model(roots, x, n)[1]
-    return x, dp.T @ problem.R @ dp
+    return x, dp.T @ problem.gram @ dp

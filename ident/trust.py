@@ -16,7 +16,7 @@ CLEAR = 2.0  # held-out error of the baseline over the noise from which it tells
 CLOSED = 0.5  # share of the gap that the extended model must then close
 CARRIED = 0.8  # the same where it explains the data that it was fitted to down to the noise
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
-LEFT_ERROR = 3.0  # the same above which an unknown cause remains however strong the named ones are
+LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
 
 

@@ -19,6 +19,10 @@ class DataError(Exception):
         self.what, self.where, self.found, self.expected = what, where, found, expected
         super().__init__(f"{_line(what)}: {_line(where, 400)}: found {_line(found)}, expected {_line(expected, 400)}")
 
+    def __reduce__(self) -> tuple:
+        """As it was made: it reaches other processes."""
+        return type(self), (self.what, self.where, self.found, self.expected)
+
 
 def _line(text: str, longest: int = LONGEST) -> str:
     """The text on one line, without control characters, shortened in the middle."""

@@ -51,7 +51,7 @@ def test_a_search_without_time_says_so_and_names_nothing(friction):
     verdict = diagnose(friction[0], max_seconds=0.0)
     assert verdict.discrepancy.detected and not verdict.causes
     assert verdict.unexplained_verdict == "unknown cause remains"
-    assert "ended after 0 s" in verdict.notes[0]
+    assert "0 s for the search" in verdict.notes[0]
     assert json.loads(friction[1])["notes"] == []
 
 
@@ -80,6 +80,15 @@ def test_threads_are_those_asked_for(monkeypatch):
     monkeypatch.setenv("SIMGAP_THREADS", "3")
     assert thread_count() == 3
     assert map_threads(lambda x: x * x, range(5)) == [0, 1, 4, 9, 16]
+
+
+def test_a_clear_error_stays_one_on_its_way_from_another_process():
+    def fails(x):
+        raise DataError("a", "b", "c", "d")
+
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with pytest.raises(DataError, match="a: b: found c, expected d"):
+            Workers(pool).map(fails, [1])
 
 
 def test_functions_made_on_the_spot_reach_other_processes():

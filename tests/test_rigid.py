@@ -13,6 +13,7 @@ from ident.diagnose import diagnose_fully, set_up, with_held_out
 from ident.graybox import LinkChange, Parameters, build_structure
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, fit_rigid, regressor
+from robot_assets.robot import Elasticity
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
 from tests.conftest import small_plan, through_files
@@ -109,6 +110,14 @@ def test_links_that_are_not_as_described_are_found(moved, ur10):
     true, fitted, described = (x + p * a for x, p in ((true, problem.nominal.inertia), (fitted, found.par.inertia), (described, problem.nominal.inertia)))
     error, gap = (np.sqrt(np.mean((x - true) ** 2, axis=0)) for x in (fitted, described))
     assert np.all(error[1:] < 0.1 * gap[1:])
+
+
+def test_a_hinge_across_a_joint_keeps_the_inertia_that_was_found(ur10):
+    own = build_structure(ur10)
+    heavy = {n: pin.Inertia(2 * own.model.inertias[i].mass, own.model.inertias[i].lever, own.model.inertias[i].inertia) for n, i in own.carriers.items()}
+    hinge = Elasticity("bend", "elbow_joint", (1.0, 0.0, 0.0), 1e5, 10.0)
+    masses = [sum(x.mass for x in list(build_structure(ur10, elasticities=h, inertias=heavy).model.inertias)[1:]) for h in ((), (hinge,))]
+    assert masses == pytest.approx([2 * sum(x.mass for x in list(own.model.inertias)[1:])] * 2)
 
 
 def test_links_as_described_stay_as_they_are(ur10):
