@@ -20,6 +20,7 @@ from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
 from ident.show.figures import trace_figure
 from ident.verdict import Diagnosis
+from robot_assets.robot import linear_joints
 
 COLOURS = (
     "<style>svg { --ink: #16181a; --soft: #5c666f; --line: #dfe3e6; --before: #c0492f; --after: #1f6f8b; background: #ffffff }</style>"
@@ -127,7 +128,8 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
     if v.gain is not None:
         g = v.gain
         closed = "" if g.gap_closed is None else f", {g.gap_closed:.1%} of the gap to the noise"
-        lines += [f"Torque error on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} N m{closed}; noise {g.noise_floor:.2g}.", ""]
+        unit = "N" if all(linear_joints(result.robot)) else "N m"
+        lines += [f"Error on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} {unit}{closed}; noise {g.noise_floor:.2g}.", ""]
     if v.residual_description:
         lines += [v.residual_description, ""]
     for trace in result.traces[: int(machine.picture)]:
@@ -143,7 +145,7 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--only", default="", help="folders, comma-separated; the page is then printed, not written")
+    parser.add_argument("--only", default="", help="folders, comma-separated; the page is then printed, not written, and pictures are")
     parser.add_argument("--max-seconds", type=float, default=300.0)
     args = parser.parse_args()
     only = set(filter(None, args.only.split(",")))

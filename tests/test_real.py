@@ -82,7 +82,7 @@ def named(verdict):
     [
         ("emps_drive", "emps", ["DATA_EMPS.mat"], 2, 0.25),
         ("kuka_kr300_dual_encoder", "kr300", None, 2, 0.45),
-        ("ur10_unisa", "ur10_bare", None, 3, 0.3),
+        ("ur10_unisa", "ur10_bare", None, 2, 0.35),
         ("panda_gaz_ral2019", "panda_bare", [f"exciting_traj_{x}.txt" for x in ("positions", "time", "torques", "velocity")], 1, 0.5),
         ("staubli_tx40", "tx40", None, 1, 0.9),
     ],
