@@ -28,7 +28,7 @@ from blind_summary import pictures, table
 from outside import draw_outside
 from provenance import commit
 
-from ident.dataset import Dataset
+from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
 from ident.excitation import Plan, operating_points
@@ -61,12 +61,12 @@ class Case:
 
     def truth(self) -> list[dict]:
         return [
-            {"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e)), "size": self.size_of(e)}
-            for e in self.hidden
+            {"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e)), "size": size}
+            for e, size in zip(self.hidden, self.sizes(), strict=True)
         ]
 
-    def size_of(self, effect: object) -> float:
-        """Distortion over noise: what an effect alone changes at the joint that shows it most.
+    def sizes(self) -> list[float]:
+        """Distortion over noise of each effect: what it alone changes at the joint that shows it most.
 
         Root mean square over the excited band of the change of torque and position lines, over the noise of
         these lines, at the first posture and the largest level; the plant is simulated without noise.
@@ -76,17 +76,24 @@ class Case:
         top = max(e.amplitude for e in plan.experiments)
         some = tuple(e for e in plan.experiments if (e.operating_point, e.amplitude) == (first, top))
         small = replace(plan, experiments=some, trajectories=())
-        pair = [
-            run_experiment(small, effects, seed=self.seed, drives=self.drives, timestep=self.timestep, noise=0.0)
-            for effects in ([], [effect])
-        ]
-        power, lines = np.zeros(robot.n), int(plan.excitation.lines.max()) + 1
-        for a, b in zip(*(d.segments for d in pair), strict=True):
-            for channel, std in (("tau", robot.array("tau_std")), ("q", robot.array("q_std"))):
-                change = scipy.fft.rfft((b.periodic(channel) - a.periodic(channel)).mean(axis=0), axis=0, norm="forward")
-                noise = std**2 / (a.period * a.steady_periods)
-                power += np.mean(np.abs(change[:lines]) ** 2, axis=0) / noise / (2 * len(some))
-        return float(np.sqrt(power.max()))
+        lines = int(plan.excitation.lines.max()) + 1
+
+        def quiet(effects: list) -> tuple[Segment, ...]:
+            return run_experiment(
+                small, effects, seed=self.seed, drives=self.drives, timestep=self.timestep, noise=0.0
+            ).segments
+
+        def size(changed: tuple[Segment, ...]) -> float:
+            power = np.zeros(robot.n)
+            for a, b in zip(plain, changed, strict=True):
+                for channel, std in (("tau", robot.array("tau_std")), ("q", robot.array("q_std"))):
+                    change = scipy.fft.rfft((b.periodic(channel) - a.periodic(channel)).mean(axis=0), axis=0, norm="forward")
+                    noise = std**2 / (a.period * a.steady_periods)
+                    power += np.mean(np.abs(change[:lines]) ** 2, axis=0) / noise / (2 * len(some))
+            return float(np.sqrt(power.max()))
+
+        plain = quiet([]) if self.hidden else ()
+        return [size(quiet([effect])) for effect in self.hidden]
 
 
 def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: str) -> Case:

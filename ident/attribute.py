@@ -29,7 +29,6 @@ from ident.torque_fit import (
     joint_costs,
     make_weights,
     predictions,
-    weighted_cost,
 )
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
@@ -199,7 +198,7 @@ def companions(
         return current, []
     preds = predictions(problem, current.model, current.remainders)
     noise = current.count / problem.structure.n
-    left = np.maximum(joint_costs(problem, preds, current.weights) - noise, 1.0)
+    left = np.maximum(current.costs - noise, 1.0)
     scores = [
         s
         for s in screen(problem, current, preds, same)
@@ -213,7 +212,7 @@ def companions(
     found = refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
     if found is None:
         return current, []
-    after = joint_costs(problem, predictions(problem, found.model, found.remainders), current.weights) - noise
+    after = found.costs - noise
     kept = [s for s in scores if after[s.hypothesis.joint] < (1.0 - MIN_SHARE) * left[s.hypothesis.joint]]
     if len(kept) < 2:
         return current, []
@@ -228,20 +227,16 @@ def companions(
     return last, rounds
 
 
-def explained(problem: Problem, before: Fit, after: Fit) -> float:
+def explained(before: Fit, after: Fit) -> float:
     """Share of the excess over noise that a cause explains: of all of it, or at the joint where it explains most.
 
     Of several causes at different joints each explains a part of the whole and most of its own joint.
     """
-    costs = [
-        joint_costs(problem, predictions(problem, result.model, result.remainders), result.weights)
-        for result in (before, after)
-    ]
-    falls = costs[0] - costs[1]
+    falls = before.costs - after.costs
     joint = int(np.argmax(falls))
-    noise = before.count / problem.structure.n
-    whole = np.sum(falls) / max(np.sum(costs[0]) - before.count, 1.0)
-    return float(max(whole, falls[joint] / max(costs[0][joint] - noise, 1.0)))
+    noise = before.count / len(falls)
+    whole = np.sum(falls) / max(before.cost - before.count, 1.0)
+    return float(max(whole, falls[joint] / max(before.costs[joint] - noise, 1.0)))
 
 
 def revived(problem: Problem, model: Model) -> Model:
@@ -314,10 +309,10 @@ def attribute_once(
     before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost), workers)
     if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count and not workers.late:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
-    rivals, excess = rivals_of_best(problem, before, ranked)
+    rivals, excess = rivals_of_best(before, ranked)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
-    share = max(explained(problem, before, weighed[0].fit), softly.get(id(weighed[0].hypothesis), 0.0))
+    share = max(explained(before, weighed[0].fit), softly.get(id(weighed[0].hypothesis), 0.0))
     return Round(before, tuple(weighed), tuple(scores), scale, share)
 
 
@@ -335,7 +330,7 @@ def worth_a_refit(current: Fit) -> float:
 
 
 def rivals_of_best(
-    problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
+    before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
 ) -> tuple[list[tuple[Hypothesis, Fit]], float]:
     """Candidates that explain some of what the best one does, and the excess over noise that they leave there.
 
@@ -344,16 +339,13 @@ def rivals_of_best(
     """
     ranked = sorted(ranked, key=lambda x: x[1].cost)
     best, top = ranked[0]
-    costs = [
-        joint_costs(problem, predictions(problem, r.model, r.remainders), r.weights) for r in (before, *(r for _, r in ranked))
-    ]
-    falls = [costs[0] - c for c in costs[1:]]
-    if best.channel == "model" or best.joint < 0 or falls[0].max() <= 0.0:
-        return list(ranked), max(top.cost - before.count, 0.0)
-    at = int(np.argmax(falls[0]))
-    kept = [k for k, fall in enumerate(falls) if fall[at] >= RIVAL * falls[0][at]]
-    left = min(costs[1 + k][at] for k in kept) - before.count / problem.structure.n
-    return [ranked[k] for k in kept], max(float(left), 0.0)
+    falls = before.costs - top.costs
+    at = int(np.argmax(falls))
+    if best.channel == "model" or best.joint < 0 or falls[at] <= 0.0:
+        return ranked, max(top.cost - before.count, 0.0)
+    kept = [(h, r) for h, r in ranked if before.costs[at] - r.costs[at] >= RIVAL * falls[at]]
+    left = min(r.costs[at] for _, r in kept) - before.count / len(falls)
+    return kept, max(float(left), 0.0)
 
 
 def explore_softly(
@@ -371,7 +363,7 @@ def explore_softly(
     """
     stage, level = soften(problem, current)
     found, scores = explore(problem, stage, hypotheses, 0.0, workers, rough=True)
-    softly = {id(h): explained(problem, stage, r) for h, r in found[:FINALISTS]}
+    softly = {id(h): explained(stage, r) for h, r in found[:FINALISTS]}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
@@ -417,7 +409,7 @@ def under_noise_of_best(
 def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
     """A fit as it stands, its cost under other weights."""
     preds = predictions(problem, result.model, result.remainders)
-    return replace(result, cost=weighted_cost(problem, preds, weights), weights=weights)
+    return replace(result, costs=joint_costs(problem, preds, weights), weights=weights)
 
 
 def explore(
@@ -545,7 +537,7 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
     of the time hardly shows its inertia: the linear step of a score says little about either.
     """
     preds = predictions(problem, stage.model, stage.remainders)
-    loudest = int(np.argmax(joint_costs(problem, preds, stage.weights)))
+    loudest = int(np.argmax(stage.costs))
     scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} if j >= 0}
     return [
         replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))

@@ -75,8 +75,8 @@ def conclude(
     rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
     for effect in named_effects(final):
         found = rounds[effect.hypothesis.key]
-        trust = known_probability(left_of(problem, effect, result), doubted)
-        trust *= explained_share(problem, found, final)
+        trust = known_probability(left_of(effect.hypothesis, result), doubted)
+        trust *= explained_share(found, final)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
     direct = [_rounded(x, dataset.joints[x.joint]) for x in steps]
     direct += [_late(x, dataset.joints[x.joint]) for x in late]
@@ -110,7 +110,7 @@ def conclude(
         sentence=sentence(causes, unknown, detected, gain),
         unidentified=undetermined,
         residual_description=description,
-        notes=() if rigid is None else (inertia_note(problem, rigid, baseline, result),),
+        notes=() if rigid is None else (inertia_note(rigid, baseline, result),),
     )
 
 
@@ -140,7 +140,7 @@ def inertia_values(rigid: RigidFit) -> dict[str, Value]:
     return out
 
 
-def inertia_note(problem: Problem, rigid: RigidFit, baseline: Fit, result: Attribution) -> str:
+def inertia_note(rigid: RigidFit, baseline: Fit, result: Attribution) -> str:
     """What the inertias of the links do, in a sentence."""
     before, after = (np.sqrt(x.chi2_per_dof) for x in (baseline, result.baseline))
     return (

@@ -33,9 +33,7 @@ from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, fit_rigid
 from ident.torque_fit import Fit, Problem, data_count, fit, predictions
-from ident.trust import (
-    LEFT_ERROR,
-)
+from ident.trust import LEFT_ERROR
 from ident.verdict import Diagnosis, Gain, Verdict
 from robot_assets.errors import DataError
 
@@ -218,7 +216,7 @@ def diagnose_fully(
     setup, baseline = identify(dataset, progress=say)
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     nominal, rigid = setup.problem.nominal, None
-    if unresolved(result) and not workers.late and all(g.window is not None for g in setup.problem.groups):
+    if unresolved(result) and not workers.late and setup.problem.motions_alone:
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
     problem, cut = setup.problem, workers.late
     say("gain on held-out data")

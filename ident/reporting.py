@@ -12,7 +12,7 @@ from ident.dataset import Dataset, Segment
 from ident.extended import Effect, Model, Prediction, predict
 from ident.frf import estimate_frf
 from ident.records import Group
-from ident.torque_fit import Fit, Problem, joint_costs, noise_covariance, residual
+from ident.torque_fit import Fit, Problem, noise_covariance, residual
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
 from robot_assets.errors import DataError
 
@@ -192,7 +192,7 @@ def evidence_plot(
 
 def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> str:
     """Where an unexplained residual sits: joint, band, growth with level, best variable."""
-    power = joint_costs(problem, predictions, fit.weights)
+    power = fit.costs
     levels: dict[float, list[float]] = {}
     spectra = []
     for group, pred in zip(problem.groups, predictions, strict=True):

@@ -155,7 +155,7 @@ def regressor(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray, bodies:
         shape = np.zeros((3, 3))
         shape[i, j] = shape[j, i] = 1.0
         probes.append((0.0, np.zeros(3), shape))
-    of_probe = np.array([_parameters(*probe) for probe in probes])
+    of_probe = np.array([pin.Inertia(*probe).toDynamicParameters() for probe in probes])
     none = replace(chain, mass=0 * chain.mass, lever=0 * chain.lever, inertia=0 * chain.inertia)
     out = []
     for body in bodies:
@@ -166,12 +166,6 @@ def regressor(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray, bodies:
             columns.append(newton_euler(alone, q, v, a))
         out.append(np.stack(columns, axis=-1) @ np.linalg.inv(of_probe).T)
     return np.concatenate(out, axis=-1)
-
-
-def _parameters(mass: float, lever: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """(10,) of a body given by mass, centre of mass and inertia about that."""
-    about = inertia + mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
-    return np.concatenate([[mass], mass * lever, about[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]])
 
 
 def _pseudo(p: np.ndarray) -> np.ndarray:

@@ -56,6 +56,10 @@ class Problem:
     free_timing: bool = True
     step_std: np.ndarray | float = 0.0
 
+    @property
+    def motions_alone(self) -> bool:
+        return all(group.window is not None for group in self.groups)
+
     def samples(self, group: Group) -> int:
         return round(group.period_time / self.sampling.sample_time)
 
@@ -80,7 +84,7 @@ class Fit:
 
     Attributes:
         model: chain, parameters and effects at the minimum.
-        cost: whitened sum of squares, prior excluded.
+        costs: (n,) whitened sum of squares by joint, prior excluded.
         count: real data that entered.
         information: (p, p) normal matrix of the fitted coordinates, prior excluded.
         names: of the fitted coordinates.
@@ -91,7 +95,7 @@ class Fit:
     """
 
     model: Model
-    cost: float
+    costs: np.ndarray
     count: int
     information: np.ndarray
     names: tuple[str, ...]
@@ -99,6 +103,10 @@ class Fit:
     weights: Weights
     converged: bool
     softer: tuple[Fit, ...] = ()
+
+    @property
+    def cost(self) -> float:
+        return float(np.sum(self.costs))
 
     @property
     def chi2_per_dof(self) -> float:
@@ -374,7 +382,7 @@ def fit(
         weights = make_weights(problem, preds, rho)
     cost = weighted_cost(problem, preds, weights)
     settled = model, preds, Ws, cost
-    if all(group.window is not None for group in problem.groups):
+    if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
     # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
@@ -428,9 +436,9 @@ def fit(
             converged = True
             break
     if np.any(drift):
-        model, preds, Ws, cost = _settled(problem, settled, model, weights)
+        model, preds, Ws, _ = _settled(problem, settled, model, weights)
     H, _ = _normal(problem, model, preds, weights)
-    return Fit(model, cost, count, H, coordinate_names(model), tuple(Ws), weights, converged)
+    return Fit(model, joint_costs(problem, preds, weights), count, H, coordinate_names(model), tuple(Ws), weights, converged)
 
 
 Settled = tuple[Model, list[Prediction], list[np.ndarray], float]

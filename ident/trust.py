@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ident.attribute import DETECTION_EXCESS, Attribution, Round
-from ident.extended import Effect
-from ident.torque_fit import Fit, Problem, joint_costs, predictions
+from ident.hypotheses import Hypothesis
+from ident.torque_fit import Fit, Problem
 from ident.verdict import Gain
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
@@ -20,35 +20,31 @@ LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause rema
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
 
 
-def _at(effect: Effect, costs: np.ndarray) -> float:
+def _at(h: Hypothesis, costs: np.ndarray) -> float:
     """Of costs by joint, those that an effect answers for: its joint, or all where it changes the chain."""
-    h = effect.hypothesis
     return float(costs[h.joint] if h.joint >= 0 and h.channel != "model" else np.sum(costs))
 
 
-def _excess(problem: Problem, result: Fit, level: float) -> np.ndarray:
+def _excess(result: Fit, level: float) -> np.ndarray:
     """(n,) whitened cost of a fit by joint beyond ``level`` times the noise."""
-    costs = joint_costs(problem, predictions(problem, result.model, result.remainders), result.weights)
-    return np.maximum(costs - level * result.count / problem.structure.n, 0.0)
+    return np.maximum(result.costs - level * result.count / len(result.costs), 0.0)
 
 
-def left_of(problem: Problem, effect: Effect, result: Attribution) -> float:
+def left_of(h: Hypothesis, result: Attribution) -> float:
     """Share of the discrepancy that is left where an effect sits, 0 to 1: there no other cause hides behind it."""
-    before = _at(effect, _excess(problem, result.baseline, 1.0))
-    after = _at(effect, _excess(problem, result.final, DETECTION_EXCESS))
+    before = _at(h, _excess(result.baseline, 1.0))
+    after = _at(h, _excess(result.final, DETECTION_EXCESS))
     return float(np.clip(after / max(before, 1e-300), 0.0, 1.0)) if after > 0.0 else 0.0
 
 
-def explained_share(problem: Problem, found: Round, final: Fit) -> float:
+def explained_share(found: Round, final: Fit) -> float:
     """What a cause explains where it sits, over that and what is left there at the end: 1 where nothing is left.
 
     A cause that explains less than the unknown may be the unknown's own shadow.
     """
-    after = found.candidates[0].fit
-    effect = after.model.effects[-1]
-    effect = next((e for e in after.model.effects if e.hypothesis.key == found.candidates[0].hypothesis.key), effect)
-    fall = max(_at(effect, _excess(problem, found.before, 0.0)) - _at(effect, _excess(problem, after, 0.0)), 0.0)
-    left = _at(effect, _excess(problem, final, LEFT_NOISE))
+    winner = found.candidates[0]
+    fall = max(_at(winner.hypothesis, found.before.costs - winner.fit.costs), 0.0)
+    left = _at(winner.hypothesis, _excess(final, LEFT_NOISE))
     return fall / max(fall + left, 1e-300)
 
 
@@ -81,7 +77,7 @@ def collapsed(problem: Problem, final: Fit) -> bool:
     # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
     # its link: there the gears take up what else is wrong, and only a motor that is known tells.
     low = x[drives] < -limit
-    if all(group.window is not None for group in problem.groups):
+    if problem.motions_alone:
         known[:n] = False
         low &= known
     return final.chi2_per_dof > LEFT_ERROR and bool(np.any(low | (known & (x[drives] > limit))))

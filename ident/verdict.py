@@ -189,7 +189,7 @@ class FrfView:
 class Diagnosis:
     """Everything a report or recording shows.
 
-    ``inertias`` of bodies by joint of the chain, where they were found; ``parameters`` of the drives.
+    ``inertias`` of bodies by joint of the description, where they were found; ``parameters`` of the drives.
     """
 
     verdict: Verdict

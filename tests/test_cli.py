@@ -45,6 +45,14 @@ def test_diagnose_writes_everything(dataset, tmp_path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"verdict.json", "report.html", "recording.rrd", "model.toml", "model.xml"}
 
 
+def test_diagnose_takes_an_executor_and_a_time(dataset, tmp_path):
+    run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--executor", "cores")
+    assert run.returncode == 2 and "--executor" in run.stderr and not (tmp_path / "out").exists()
+    run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--executor", "processes:2", "--max-seconds", 0, "--json", "--quiet")
+    assert run.returncode == 0, run.stderr
+    assert "0 s for the search" in json.loads(run.stdout)["notes"][-1]
+
+
 def test_experiment_writes_a_dataset_that_checks(tmp_path):
     run = simgap("experiment", "twomass", "--out", tmp_path / "d", "--effect", "coulomb_friction@drive:torque=0.3", "--points", 1, "--quiet")
     assert run.returncode == 0, run.stderr

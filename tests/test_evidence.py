@@ -75,7 +75,7 @@ def test_costs_by_joint_add_up_and_a_better_fit_explains_more(identified):
     costs = joint_costs(setup.problem, preds, result.weights)
     assert costs.shape == (6,) and costs.sum() == pytest.approx(result.cost, rel=1e-6)
     assert weighted_cost(setup.problem, preds, result.weights) == pytest.approx(result.cost, rel=1e-6)
-    assert explained(setup.problem, result, result) == pytest.approx(0.0, abs=1e-9)
+    assert explained(result, result) == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("channel", ["motor", "spring", "link", "position", "drive"])
@@ -129,14 +129,14 @@ def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
     from ident.trust import collapsed
 
     _, setup, baseline = identified
-    bad = replace(baseline, cost=10.0 * baseline.cost)
+    bad = replace(baseline, costs=10.0 * baseline.costs)
     moved = baseline.model.par.stiffness * np.array([1, 1, 0.1, 1, 1, 1])
     spoilt = replace(bad, model=replace(bad.model, par=replace(bad.model.par, stiffness=moved)))
     stiff = replace(bad, model=replace(bad.model, par=replace(bad.model.par, stiffness=100.0 * baseline.model.par.stiffness)))
     unseen = replace(stiff, information=1e-12 * stiff.information)
     assert not collapsed(setup.problem, bad)
     assert collapsed(setup.problem, spoilt) and collapsed(setup.problem, stiff)
-    assert not collapsed(setup.problem, replace(spoilt, cost=baseline.cost))
+    assert not collapsed(setup.problem, replace(spoilt, costs=baseline.costs))
     assert not collapsed(setup.problem, unseen)
 
 

@@ -73,7 +73,7 @@ def build_mjcf(
 
     Args:
         parameters: by the names of ``ident.graybox.parameter_names``.
-        inertias: of bodies by joint of the chain, instead of those of the description.
+        inertias: of bodies by joint of the description, instead of those of the description.
     """
     hinges = tuple(
         replace(
