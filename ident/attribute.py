@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from ident.extended import Effect, Model
+from ident.extended import Effect, Model, along_record, as_loop, is_along_record
 from ident.hypotheses import Hypothesis, Parameter, catalogue
 from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
@@ -33,6 +33,7 @@ from ident.torque_fit import (
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
+RECORD_EXCESS = 1.6  # the same of a model along the record
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain beyond that
@@ -45,6 +46,9 @@ NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 HOPEFUL = 5  # candidates fitted further after the first steps
+AS_GOOD = 0.8  # cost of a loop over that along the record, below which it is the loop that is right
+IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
+UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
@@ -157,7 +161,7 @@ def attribute(
     detected = p_value < DETECTION_LEVEL and baseline.chi2_per_dof > DETECTION_EXCESS
     hypotheses = tuple(hypotheses if hypotheses is not None else catalogue(problem.structure))
     current, rounds, unknown, count = baseline, [], False, 0
-    while detected and count < max_causes and current.chi2_per_dof > DETECTION_EXCESS and not workers.late:
+    while detected and count < max_causes and not settled(current) and not workers.late:
         workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
         found = attribute_once(problem, current, hypotheses, workers)
         if not found.candidates:
@@ -179,6 +183,12 @@ def attribute(
         taken = {e.hypothesis.key for e in current.model.effects}
         hypotheses = tuple(h for h in hypotheses if h.key not in taken)
     return Attribution(baseline, detected, p_value, tuple(rounds), current, unknown)
+
+
+def settled(current: Fit) -> bool:
+    """Whether a model leaves no more than noise, as far as that is known: along the record, by a few draws."""
+    along = any(is_along_record(e.hypothesis) for e in current.model.effects)
+    return current.chi2_per_dof <= (RECORD_EXCESS if along else DETECTION_EXCESS)
 
 
 def companions(
@@ -304,16 +314,38 @@ def attribute_once(
     for h, result in found:
         if not pointless(result.model.effects[-1]) and (id(h) not in best or result.cost < best[id(h)][1].cost):
             best[id(h)] = h, result
-    if not best:
-        return Round(before, (), tuple(scores), 1.0, 0.0)
-    before, ranked = under_noise_of_best(problem, before, sorted(best.values(), key=lambda x: x[1].cost), workers)
-    if before.chi2_per_dof > FAINT and left_by(ranked) > FAINT * before.count and not workers.late:
+    ranked = sorted(best.values(), key=lambda x: x[1].cost)
+    if ranked:
+        before, ranked = under_noise_of_best(problem, before, ranked, workers)
+    spoilt = implausible(problem, before) or (ranked and ranked[0][0].options.get("bends"))
+    allowed = DETECTION_EXCESS - 1.0 if spoilt else FAINT
+    if min(before.chi2_per_dof - 1.0, left_by(ranked) / before.count) > allowed and not workers.late:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
+    if not ranked:
+        return Round(before, (), tuple(scores), 1.0, 0.0)
     rivals, excess = rivals_of_best(before, ranked)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     share = max(explained(before, weighed[0].fit), softly.get(id(weighed[0].hypothesis), 0.0))
     return Round(before, tuple(weighed), tuple(scores), scale, share)
+
+
+def implausible(problem: Problem, result: Fit) -> bool:
+    """Whether drives of a fit cannot be those of this arm: a stiffness or motor inertia far from its starting guess.
+
+    They then stand for what is missing.
+    """
+    n, x = problem.structure.n, result.model.par.to_log() - problem.nominal.to_log()
+    drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
+    known = np.sqrt(np.maximum(np.diag(result.covariance())[drives], 0.0)) < UNDETERMINED
+    limit = np.log(IMPLAUSIBLE)
+    # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
+    # its link: there the gears take up what else is wrong, and only a motor that is known tells.
+    low = x[drives] < -limit
+    if problem.motions_alone:
+        known[:n] = False
+        low &= known
+    return bool(np.any(low | (known & (x[drives] > limit))))
 
 
 def worth_a_refit(current: Fit) -> float:
@@ -389,20 +421,26 @@ def under_noise_of_best(
     """Candidates, and the model without them, under the noise that the best of them sees.
 
     Noise of the position reaches the torque through the laws of effects; weights without them would
-    take it for model error.
+    take it for model error. A law along the record turns all noise into a residual of its own: what is left of that
+    is compared as it is, in units of its own noise, with what others leave in units of theirs.
 
     Args:
         ranked: candidates, best first; the first ``FINALISTS`` are fitted again.
     """
+    if is_along_record(ranked[0][0]):
+        return before, list(ranked)
     top = ranked[0][1]
     weights = make_weights(problem, predictions(problem, top.model, top.remainders), 0.0)
 
-    def moved(result: Fit) -> Fit | None:
-        return refit(problem, result.model, weights, result.remainders)
+    def moved(pair: tuple[Hypothesis, Fit]) -> Fit | None:
+        return None if is_along_record(pair[0]) else refit(problem, pair[1].model, weights, pair[1].remainders)
 
-    fits = workers.map(moved, [r for _, r in ranked[:FINALISTS]])
+    fits = workers.map(moved, ranked[:FINALISTS])
     again = [*fits, *[None] * len(ranked[FINALISTS:])]
-    weighed = [(h, new or reweighted(problem, r, weights)) for (h, r), new in zip(ranked, again, strict=True)]
+    weighed = [
+        (h, r if is_along_record(h) else new or reweighted(problem, r, weights))
+        for (h, r), new in zip(ranked, again, strict=True)
+    ]
     return reweighted(problem, before, weights), weighed
 
 
@@ -509,7 +547,8 @@ def beside_strong(
 
     A strong effect that is missing moves the drives to where none of its steps leads back, and with
     them the noise that the model passes on: a joint that sticks looks like one without motor inertia.
-    Strong effects are therefore fitted from the starting guesses of the drives, under their own noise.
+    Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
+    gear first along the record, where nothing depends on how a loop moves under parameters that are not right yet.
     """
 
     def annealed(score: Score) -> Fit | None:
@@ -519,15 +558,26 @@ def beside_strong(
         except NOT_COMPUTED:
             return None
 
-    likely = min(ranked, key=lambda x: x[1].cost)[0].joint
+    def tried(scores: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
+        fits = workers.map(annealed, scores, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+        return [(s.hypothesis, r) for s, r in zip(scores, fits, strict=True) if r and not pointless(r.model.effects[-1])]
+
+    likely = min(ranked, key=lambda x: x[1].cost)[0].joint if ranked else -1
     chosen = strong_effects(problem, before, scores, likely)
-    fits = workers.map(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
-    strong = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
+    loops = [s for s in chosen if s.hypothesis.channel == "spring"]
+    strong = tried([replace(s, hypothesis=along_record(s.hypothesis)) for s in loops])
+    strong = [x for x in strong if not implausible(problem, x[1])]
+    strong = workers.map(lambda x: simulated(problem, *x), sorted(strong, key=lambda x: x[1].cost)[:FINALISTS])
+    strong += tried([s for s in chosen if s.hypothesis.channel != "spring"])
+    if left_by(strong) > SETTLED * max(before.cost - before.count, 1.0):
+        strong += tried(loops)
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
-    again = {h.key for h, _ in strong}
-    others = [(h, r) for h, r in ranked if h.key not in again]
-    return under_noise_of_best(problem, before, sorted(strong, key=lambda x: x[1].cost) + others, workers)
+    best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
+    for h, r in sorted(strong, key=lambda x: x[1].cost):
+        best.setdefault(h.key, (h, r))
+    others = [(h, r) for h, r in ranked if h.key not in best]
+    return under_noise_of_best(problem, before, [*best.values(), *others], workers)
 
 
 def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely: int) -> list[Score]:
@@ -544,6 +594,20 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
         for s in scores
         if s.hypothesis.joint in scales and "size" in s.hypothesis.options
     ]
+
+
+def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:
+    """A law of the gear that was fitted along the record, as the loop that it is where that reaches the noise, or nearly.
+
+    It does not where the arm has several steady motions: it rattles, or its gear bends a resonance over.
+    """
+    loop = as_loop(h)
+    *others, last = result.model.effects
+    model = replace(result.model, effects=(*others, replace(last, hypothesis=loop)))
+    other = refit(problem, model, result.weights, result.remainders, FIRST_STEPS)
+    if other is not None and (other.chi2_per_dof < DETECTION_EXCESS or other.cost < AS_GOOD * result.cost):
+        return loop, other
+    return h, result
 
 
 def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:

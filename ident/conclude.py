@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident.attribute import Attribution, Candidate, pointless
+from ident.attribute import UNDETERMINED, Attribution, Candidate, pointless
 from ident.dataset import Dataset
-from ident.extended import Effect, Prediction
+from ident.extended import Effect, Prediction, is_along_record
 from ident.graybox import INERTIAL, parameter_unit
 from ident.link_sensor import LinkDelay
 from ident.next_experiment import NextExperiment, advice
@@ -19,7 +19,6 @@ from ident.torque_fit import Fit, Problem
 from ident.trust import (
     LEFT_ERROR,
     LEFT_NOISE,
-    UNDETERMINED,
     collapsed,
     explained_share,
     fails_held_out,
@@ -110,7 +109,10 @@ def conclude(
         sentence=sentence(causes, unknown, detected, gain),
         unidentified=undetermined,
         residual_description=description,
-        notes=() if rigid is None else (inertia_note(rigid, baseline, result),),
+        notes=(
+            *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
+            *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
+        ),
     )
 
 
@@ -138,6 +140,14 @@ def inertia_values(rigid: RigidFit) -> dict[str, Value]:
             name = f"{kind}.{body}"
             out[name] = Value(float(v), float(s), parameter_unit(name))
     return out
+
+
+def record_note(effect: Effect) -> str:
+    """How the torque of a gear was predicted that has several steady motions, in a sentence."""
+    return (
+        f"With {effect.hypothesis.effect.replace('_', ' ')} {effect.hypothesis.place} has several steady motions: in the"
+        " periodic segments the recorded torque said which it made, a simulation may settle in another."
+    )
 
 
 def inertia_note(rigid: RigidFit, baseline: Fit, result: Attribution) -> str:

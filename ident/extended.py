@@ -29,6 +29,11 @@ from ident.records import NOISE_LINES, POINTS_PER_LINE, Group, mean_over_lines
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of periodic data, at least
 LOOP_MOST = 6  # the same, at most: modes far above the signals follow at once
+RECORD_STEPS = 20  # towards the deflection that agrees with a record
+NOISE_DRAWS = 4  # of the noise that a gear along its record answers to
+RECORD_LINES = 4  # lines on either side over which its covariance is averaged: it turns with the resonances
+LEAST_GAIN = 1e-3  # of a gear, torque at the motor per torque in parallel with its spring, that noise is divided by
+RECORD_BISECTIONS = 30  # of its mean
 LOOP_STEP = 0.25  # its step, at most, over the time scale of the fastest mode
 
 
@@ -64,17 +69,17 @@ class Model:
 class Prediction:
     """What a model predicts for a group, and what it was computed with.
 
-    ``added_stiffness`` (n,): of effects in parallel with the gears, about the motion, N m/rad;
-    ``at_motor``: effects at the motors.
+    ``added_stiffness`` (n,): of effects in parallel with the gears, about the motion, N m/rad.
     """
 
+    model: Model
+    sampling: Sampling
     structure: Structure
     par: Parameters
     plane: Plane
     solution: Solution
     U: np.ndarray
     added_stiffness: np.ndarray
-    at_motor: tuple[Effect, ...]
 
     def motion(self, group: Group) -> Motion:
         return Motion(group, self.solution, self.par)
@@ -94,26 +99,56 @@ class Prediction:
 
 
     def law_noise(self, group: Group) -> np.ndarray:
-        """(L, n) power that position noise leaves in the torque through laws at the motors, N2 m2.
+        """(L, n, n) covariance that noise leaves in the torque through laws, beyond that of a linear arm, N2 m2.
 
         A friction that turns within a small velocity carries the noise of a motor that stands still
-        with the slope of the turn. By one draw of the noise over all records.
+        with the slope of the turn; a gear along the recorded torque answers to its noise. By one draw of the noise
+        over all records.
         """
-        out = np.zeros(self.U.shape[1:])
-        if not self.at_motor:
+        L, n = self.U.shape[1:]
+        out = np.zeros((L, n, n), complex)
+        at_motor = [e for e in self.model.effects if e.hypothesis.channel == "motor"]
+        along = {e.hypothesis.joint for e in self.model.effects if is_along_record(e.hypothesis) and group.window is None}
+        if not at_motor and not along:
             return out
         rng = np.random.default_rng(0)
         draw = rng.normal(size=(2, *self.U.shape)) * np.sqrt(0.5 * group.position_noise)
-        noisy = replace(self.solution, Q=self.solution.Q + draw[0] + 1j * draw[1])
-        for effect in self.at_motor:
+        position = draw[0] + 1j * draw[1]
+        noisy = replace(self.solution, Q=self.solution.Q + position)
+        for effect in at_motor:
             j = effect.hypothesis.joint
             k = self.par.stiffness[j]
             with_noise, without = (
                 effect.hypothesis.law(effect.p, Motion(group, x, self.par), j, k) for x in (noisy, self.solution)
             )
             change = self.plane.record * self.motion(group).lines(with_noise - without)
-            out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
+            out[:, j, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
+        if along:
+            out += self._noise_along(group, sorted(along), rng)
         return out
+
+    def _noise_along(self, group: Group, joints: Sequence[int], rng: np.random.Generator) -> np.ndarray:
+        """(L, n, n) covariance where gears of ``joints`` answer to the recorded torque, beyond that of the linear arm.
+
+        By ``NOISE_DRAWS`` of the noise over all records.
+        """
+        # Taken off before the mean over lines, and put back: the gain of a gear is sharp at its resonance.
+        passed = np.ones(self.U.shape[1:])
+        for j in joints:
+            passed[:, j] = np.maximum(np.abs(self.plane.spring_gain[:, j, j]), LEAST_GAIN)
+        more = np.zeros((*passed.shape, passed.shape[1]), complex)
+        for _ in range(NOISE_DRAWS):
+            draw = rng.normal(size=(4, *self.U.shape))
+            position = (draw[0] + 1j * draw[1]) * np.sqrt(0.5 * group.position_noise)
+            torque = (draw[2] + 1j * draw[3]) * np.sqrt(0.5 * group.torque_noise)
+            moved = replace(group, Q=group.Q + position, U=group.U + torque)
+            there = predict_at(
+                self.model, self.structure, self.par, self.plane, moved, self.sampling, W=self.solution.W, steps=0
+            )
+            linear = torque - np.einsum("lij,slj->sli", self.sampled_impedance, position)
+            for x, sign in ((torque + self.U - there.U, 1.0), (linear, -1.0)):
+                more += sign * np.einsum("sli,slj->lij", x / passed, x.conj() / passed) / len(x) / NOISE_DRAWS
+        return passed[:, :, None] * mean_over_lines(more, RECORD_LINES) * passed[:, None, :]
 
 
 def predict(
@@ -157,19 +192,13 @@ def predict_at(
         Q = Q.copy()
         Q[..., j] += effect.hypothesis.law(effect.p, Motion(group, bare, par), j, par.stiffness[j])
     inner = by_channel.get("link", []) + by_channel.get("spring", [])
-    react = partial(_inner_torques, structure, par, plane, group, effects=inner) if inner else None
+    motor = by_channel.get("motor", [])
+    react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor) if inner else None
     passes = 1 if len(inner) == 1 and _closes_itself(inner[0]) else REACTION_STEPS
     solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, react=react, passes=passes, steps=steps)
     U = solution.U
-    motor = by_channel.get("motor", [])
     if motor:
-        motion = Motion(group, solution, par)
-        U = U.copy()
-        for effect in motor:
-            j = effect.hypothesis.joint
-            U[..., j] += plane.record * motion.lines(
-                effect.hypothesis.law(effect.p, motion, j, par.stiffness[j])
-            )
+        U = U + plane.record[:, None] * _motor_torques(par, Motion(group, solution, par), motor)
         solution = replace(solution, U=U)
     for effect in by_channel.get("drive", []):
         j = effect.hypothesis.joint
@@ -177,7 +206,8 @@ def predict_at(
         U[..., j] = effect.hypothesis.law(
             effect.p, Motion(group, solution, par), j, par.stiffness[j], U[..., j]
         )
-    return Prediction(structure, par, plane, solution, U, _added_stiffness(solution, by_channel.get("spring", [])), tuple(motor))
+    added = _added_stiffness(solution, by_channel.get("spring", []))
+    return Prediction(model, sampling, structure, par, plane, solution, U, added)
 
 
 def _added_stiffness(solution: Solution, effects: Sequence[Effect]) -> np.ndarray:
@@ -197,11 +227,15 @@ def _inner_torques(
     solution: Solution,
     *,
     effects: Sequence[Effect],
+    motors: Sequence[Effect],
 ) -> Torques:
     """Spring and link torques of effects, solved together with the arm they act on.
 
     A law on the gear's deflection is solved as a scalar loop through the compliance of the arm at
-    that gear, the torques of all others held.
+    that gear, the torques of all others held; or taken along the deflection that the recorded torque says.
+
+    Args:
+        effects: in the gears and on the links; motors: at the motors.
     """
     S, L, n = solution.Q.shape
     motor = np.zeros((S, L, n), complex)
@@ -220,6 +254,7 @@ def _inner_torques(
         else:
             view = _link_view(motion, j, structure.driven[j])
             at_link[j] = at_link.get(j, 0.0) + motion.lines(h.law(effect.p, view, j, par.stiffness[j]))
+    at_motors = _motor_torques(par, motion, motors) if motors else 0.0
     old_gear = solution.torques.spring + np.zeros((S, L, n), complex)
     old_link = solution.torques.link + np.zeros((S, L, structure.n_coordinates), complex)
     for effect in loops:
@@ -230,14 +265,101 @@ def _inner_torques(
             free = solution.Q_a[..., c] + compliance * (old_link[..., c] - at_link.get(j, 0.0))
             at_link[j] = at_link.get(j, 0.0) + _loop(effect.hypothesis.options["loop"](effect.p), grid, free, modes)
         else:
-            free = solution.delta[..., j] + compliance * (old_gear[..., j] - at_gear.get(j, 0.0))
+            others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
-            at_gear[j] = at_gear.get(j, 0.0) + _loop(law, grid, free, modes)
+            if is_along_record(effect.hypothesis) and group.window is None:
+                said, left = _along_record(law, par, plane, group, motion, j, c, others, motor + at_motors)
+                at_gear[j] = others + said
+                motor[..., j] += left
+            else:
+                free = solution.delta[..., j] + compliance * (old_gear[..., j] - others)
+                at_gear[j] = others + _loop(law, grid, free, modes)
     for j, value in at_gear.items():
         old_gear[..., j] = value
     for j, value in at_link.items():
         old_link[..., structure.driven[j]] = value
     return Torques(spring=old_gear, link=old_link, motor=motor)
+
+
+def _motor_torques(par: Parameters, motion: Motion, effects: Sequence[Effect]) -> np.ndarray:
+    """Spectra (S, L, n) of the torques of effects at the motors."""
+    out = np.zeros_like(motion.solution.Q)
+    for effect in effects:
+        j = effect.hypothesis.joint
+        out[..., j] += motion.lines(effect.hypothesis.law(effect.p, motion, j, par.stiffness[j]))
+    return out
+
+
+def is_along_record(h: Hypothesis) -> bool:
+    """Whether a law of the gear is taken along the deflection that the recorded torque says."""
+    return bool(h.options.get("along_record"))
+
+
+def along_record(h: Hypothesis) -> Hypothesis:
+    """A law of the gear taken along the deflection that the recorded torque says.
+
+    A gear that rattles in its dead band has more than one steady state, and which of them a recording shows depends
+    on how it began: the loop solved from rest ends in another, though the model is right. The recorded torque, less
+    that of the motor, moved the link, and the link's open compliance says where that took the gear. What the law
+    leaves of that torque is passed on as the linear gear would, so that a linear law leaves what the loop does.
+    A motion, which is closed by a return that was not recorded, is predicted by the loop.
+    """
+    return replace(h, options={**h.options, "along_record": True})
+
+
+def as_loop(h: Hypothesis) -> Hypothesis:
+    """The law that ``along_record`` was made of."""
+    return replace(h, options={k: v for k, v in h.options.items() if k != "along_record"})
+
+
+def _along_record(
+    law: tuple[int, float, float, float],
+    par: Parameters,
+    plane: Plane,
+    group: Group,
+    motion: Motion,
+    j: int,
+    c: int,
+    others: np.ndarray | float,
+    motor: np.ndarray | float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Spectra (S, L) of the torque in parallel with a gear that the record says, and of what a law leaves of it.
+
+    The former moves the links; the latter is as it reaches the motor. The law is asked at the deflection that agrees
+    best with two measurements: the one that the recorded torque gives through the open compliance of the link, whose
+    noise is large where that is, and the one at which the law gives this torque, whose noise is large where the
+    gear is soft. Steps of least squares, with the largest slope of the law for its slope.
+
+    Args:
+        j, c: joint, and its link coordinate; others: (S, L) torque of other laws of the same gear; motor: (S, L, n)
+            torque of effects at the motors.
+    """
+    solution, s = motion.solution, plane.s[:, None]
+    drive = group.U / plane.record[:, None] - (s**2 * par.inertia + s * par.viscous) * solution.Q - motor
+    carried = (drive @ np.linalg.inv(par.coupling))[..., j]
+    more = (carried - solution.tau_s[..., j])[:, 1:]
+    gain = 1.0 - plane.C[:, j] * plane.A_inv[:, c, c]
+    link = plane.A_inv[1:, c, c] / gain[1:]
+    carried = carried - others
+    mean = carried[:, 0].real
+    known = np.zeros_like(carried)
+    known[:, 1:] = solution.delta[:, 1:, j] - link * more
+
+    def torque_at(x: np.ndarray, bisections: int) -> np.ndarray:
+        along = kernels.along_deflection(*law, group.to_time(x[..., None])[..., 0], mean, bisections)
+        return group.to_lines(along[..., None])[..., 0]
+
+    slope = kernels.largest_slope(*law, float(np.abs(group.to_time(known[..., None])).max()))
+    trust = np.ones(len(gain))  # of the law's measurement, against that through the link
+    trust[1:] = np.abs(link * slope) ** 2 / (1.0 + np.abs(link * slope) ** 2)
+    x = known
+    for _ in range(RECORD_STEPS):
+        miss = carried - plane.C[:, j] * x - torque_at(x, 0)
+        x = x + (1.0 - trust) * (known - x) + trust * miss / slope
+    torque = torque_at(x, RECORD_BISECTIONS)
+    said = torque.copy()
+    said[:, 1:] = (carried - plane.C[:, j] * known)[:, 1:]
+    return said, gain * (torque - said)
 
 
 def _closes_itself(effect: Effect) -> bool:

@@ -90,7 +90,12 @@ class Group:
     @cached_property
     def torque_share(self) -> np.ndarray:
         """(S, L, n) the same of the torque: a law that clips it would clip its noise, and so explain that."""
-        return _signal_share(self.U, _line_noise(self.U_periods, self.white_torque_noise))
+        return _signal_share(self.U, self.torque_noise)
+
+    @cached_property
+    def torque_noise(self) -> np.ndarray:
+        """(L, n) variance of a line of the mean torque, N2 m2, as that of the position."""
+        return _line_noise(self.U_periods, self.white_torque_noise)
 
     @property
     def posture(self) -> np.ndarray:

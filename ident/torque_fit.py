@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.columns import Columns
-from ident.extended import Effect, Model, Prediction, predict, predict_at
+from ident.extended import Effect, Model, Prediction, is_along_record, predict, predict_at
 from ident.graybox import Parameters, Structure, parameter_names
 from ident.inverse import Motion, Sampling, baseline_products
 from ident.noise import residual_covariance, white_covariance
@@ -28,6 +28,8 @@ ANNEALING = (0.5, 0.1, 0.02, 0.0)
 LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
 STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
 GAP = 1e-6  # relative change of the cost that ends a fit
+LEAST_NOISE = 0.5  # of the noise of a linear arm, that is left in any direction of the residual
+LEAK = 0.03  # of the largest share of that noise, that is in any direction too
 LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
 SHORTER = 64.0  # factor on the damping of steps then
 SETTLING_STEPS = 12  # of the remainder, before that
@@ -128,12 +130,27 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
         samples=problem.samples(group),
     )
     k = np.arange(S.shape[1])
-    S = S.copy()
-    S[:, k, k] += prediction.law_noise(group)[: group.n_compared]
+    S = _with_laws(S, prediction.law_noise(group)[: group.n_compared])
     if np.any(problem.step_std):
         variance = np.broadcast_to(np.square(problem.step_std) / problem.samples(group), k.shape)
         S += white_covariance(prediction.sampled_impedance[: group.n_compared], 0.0 * variance, variance)
     return S
+
+
+def _with_laws(S: np.ndarray, more: np.ndarray) -> np.ndarray:
+    """A covariance (K, n, n) and what laws add to it, by draws.
+
+    At least ``LEAST_NOISE`` of the former in any direction, and ``LEAK`` of the largest: draws know directions to so much.
+    """
+    if not np.any(more):
+        return S.copy()
+    root = np.linalg.cholesky(S)
+    half = np.linalg.solve(root, more)
+    relative = np.linalg.solve(root, np.conj(np.swapaxes(half, 1, 2)))
+    values, vectors = np.linalg.eigh(0.5 * (relative + np.conj(np.swapaxes(relative, 1, 2))))
+    values = np.maximum(1.0 + values, LEAST_NOISE)
+    spread = root @ vectors
+    return (spread * np.maximum(values, LEAK * values[:, -1:])[:, None, :]) @ np.conj(np.swapaxes(spread, 1, 2))
 
 
 def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float) -> Weights:
@@ -229,14 +246,19 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> 
 def _beside_gears(
     problem: Problem, model: Model, group: Group, pred: Prediction, columns: Columns
 ) -> Columns:
-    """Baseline columns beside laws of the gear, which move with its spring and damper: by differences."""
-    loops = {
-        e.hypothesis.joint
+    """Baseline columns beside laws of the gear, by differences.
+
+    These laws move with the gear's spring and damper; and where the recorded torque says its deflection, with what
+    the motor takes of that.
+    """
+    n = model.structure.n
+    loops = [
+        e.hypothesis
         for e in model.effects
         if e.hypothesis.channel == "spring" and not e.hypothesis.options.get("kinematic")
-    }
+    ]
     moved = []
-    for c in sorted({c for j in loops for c in (j, model.structure.n + j)}):
+    for c in sorted({f * n + h.joint for h in loops for f in range(4 if is_along_record(h) else 2)}):
         x = pack(model)
         x[c] += 1e-3
         there = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W)

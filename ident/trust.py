@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.attribute import DETECTION_EXCESS, Attribution, Round
+from ident.attribute import DETECTION_EXCESS, Attribution, Round, implausible
 from ident.hypotheses import Hypothesis
 from ident.torque_fit import Fit, Problem
 from ident.verdict import Gain
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
-UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it
 CLEAR = 2.0  # held-out error of the baseline over the noise from which it tells
 CLOSED = 0.5  # share of the gap that the extended model must then close
 CARRIED = 0.8  # the same where it explains the data that it was fitted to down to the noise
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
-IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
 
 
 def _at(h: Hypothesis, costs: np.ndarray) -> float:
@@ -67,20 +65,9 @@ def fails_held_out(gain: Gain | None, final: Fit) -> bool:
 def collapsed(problem: Problem, final: Fit) -> bool:
     """Whether the final model explains the data badly and with drives that cannot be those of this arm.
 
-    Stiffness or motor inertia far from the starting guesses then stand for what is missing, and so may
-    the causes that were found beside them.
+    The causes that were found beside these may stand for what is missing too.
     """
-    n, x = problem.structure.n, final.model.par.to_log() - problem.nominal.to_log()
-    drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
-    known = np.sqrt(np.maximum(np.diag(final.covariance())[drives], 0.0)) < UNDETERMINED
-    limit = np.log(IMPLAUSIBLE)
-    # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
-    # its link: there the gears take up what else is wrong, and only a motor that is known tells.
-    low = x[drives] < -limit
-    if problem.motions_alone:
-        known[:n] = False
-        low &= known
-    return final.chi2_per_dof > LEFT_ERROR and bool(np.any(low | (known & (x[drives] > limit))))
+    return final.chi2_per_dof > LEFT_ERROR and implausible(problem, final)
 
 
 def known_probability(left: float, refuted: bool) -> float:

@@ -104,7 +104,8 @@ class Hypothesis:
             to start from where no linear step leads there. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
             place of one with parameters ``old`` at the same joint. ``essential`` names the parameter without
-            which nothing is left of the effect, ``trivial(p)`` says so of all parameters together.
+            which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm
+            may have several steady motions with it.
     """
 
     effect: str

@@ -123,6 +123,46 @@ def spring_point(
     return x
 
 
+def largest_slope(code: int, a: float, b: float, k: float, reach: float) -> float:
+    """Largest stiffness of a nonlinear gear within a deflection ``reach``, N m/rad."""
+    return {CUBIC: k + 3.0 * a * reach**2, HYSTERESIS: k + a}.get(code, k)
+
+
+@njit(cache=True, nogil=True)
+def along_deflection(
+    code: int, a: float, b: float, k: float, x: np.ndarray, mean: np.ndarray, bisections: int
+) -> np.ndarray:
+    """Torque beyond ``k x`` of a nonlinear gear along a deflection, moved to where the gear carries a mean torque; (S, T).
+
+    Within a dead band that holds all of the motion many places carry none.
+
+    Args:
+        x: (S, T) rad; mean: (S,) N m of ``k x`` and the law; bisections: 0 leaves ``x`` where it is.
+    """
+    S, T = x.shape
+    out = np.empty((S, T))
+    least = k if code != 2 else min(a, k)
+    for i in range(S):
+        reach = abs(mean[i]) / least + np.abs(x[i]).max() + (a if code == 1 else b / least if code == 3 else b)
+        low, high = -reach, reach
+        for _step in range(bisections + 1):
+            offset, total, h = 0.5 * (low + high), 0.0, 0.0
+            old = x[i, T - 1] + offset
+            for _ in range(2 if code == 3 else 1):
+                total = 0.0
+                for t in range(T):
+                    new = x[i, t] + offset
+                    h = spring_torque(code, a, b, k, new, old, h)
+                    out[i, t] = h
+                    total += k * new + h
+                    old = new
+            if total > mean[i] * T:
+                high = offset
+            else:
+                low = offset
+    return out
+
+
 @njit(cache=True, nogil=True)
 def link_point(
     stiffness: float, friction: float, turn: float, q: float, v: float, dq: float, dv: float, h: float

@@ -8,6 +8,8 @@ from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.inverse import Motion
 
+SOFTEST = 0.05  # share of its stiffness that a soft middle keeps at least: with less it is a dead band
+
 
 def _static(code: int, a: float, b: float, k: float, x: np.ndarray) -> np.ndarray:
     if code == kernels.CUBIC:
@@ -37,7 +39,7 @@ def hardening_stiffness(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} stiffens with its deflection (cubic term {cubic:.3g} N m/rad3): the resonance"
         " climbs with amplitude and with gravity load.",
         variable="delta",
-        options={"size": lambda s: np.array([0.3 * s.stiffness / s.delta_rms**2])},
+        options={"size": lambda s: np.array([0.3 * s.stiffness / s.delta_rms**2]), "bends": True},
     )
 
 
@@ -62,7 +64,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} has a dead band of {gap:.3g} rad: its resonance drops at small amplitude wherever"
         " gravity does not preload it.",
         variable="delta",
-        options={"size": lambda s: np.array([0.5 * s.delta_rms])},
+        options={"size": lambda s: np.array([0.5 * s.delta_rms]), "bends": True},
     )
 
 
@@ -73,7 +75,7 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         signal = -np.clip(motion.delta(j), -shape[0], shape[0])
 
         def start(c):
-            return np.array([max(k - c[0], 0.05 * k), shape[0]]) if c[0] > 0 else None
+            return np.array([max(k - c[0], SOFTEST * k), shape[0]]) if c[0] > 0 else None
 
         return Screen((signal,), start, shape)
 
@@ -86,13 +88,13 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
             Parameter("low_stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=0.8, per_stiffness=True),
             Parameter("transition", "rad", 1e-9, 1.0, log=True, step=1e-2),
         ),
-        lambda p, delta, k: (kernels.SOFTENING, min(p[0], k), p[1], k),
+        lambda p, delta, k: (kernels.SOFTENING, float(np.clip(p[0], SOFTEST * k, k)), p[1], k),
         lambda scale: [(f * scale.delta[2],) for f in (0.1, 0.3, 0.7, 1.5)],
         screen,
         "The gear of {joint} is soft about zero torque ({low_stiffness:.3g} N m/rad within"
         " {transition:.3g} rad): its resonance falls where it carries little.",
         variable="delta",
-        options={"size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms])},
+        options={"size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms]), "bends": True},
     )
 
 

@@ -1,0 +1,112 @@
+"""Laws of the gear along the recorded torque: the linear limit, the laws themselves, and a gear that rattles."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.attribute import simulated
+from ident.diagnose import set_up
+from ident.extended import Effect, Model, along_record, as_loop, is_along_record
+from ident.hypotheses import catalogue, kernels
+from ident.torque_fit import fit, joint_costs, make_weights, predictions
+from robot_assets.robot import load_robot
+from sim import parse_effect, run_experiment
+from tests.conftest import small_plan, through_files
+
+LAWS = {
+    kernels.CUBIC: (2e6, 0.0),
+    kernels.BACKLASH: (3e-3, 0.0),
+    kernels.SOFTENING: (2e3, 2e-3),
+    kernels.HYSTERESIS: (4e3, 5.0),
+}
+STIFFNESS = 1e4
+
+
+@pytest.fixture(scope="module")
+def rattling(tmp_path_factory):
+    """(problem, true model without the gap, hypothesis, gap): an axis without gravity in a dead band."""
+    ur10, gap = load_robot("ur10"), 8e-4
+    plan = small_plan(ur10, 4)
+    data = run_experiment(plan, [parse_effect(f"backlash@shoulder_pan_joint:gap={gap}", ur10)], seed=4)
+    problem = set_up(through_files(data, tmp_path_factory.mktemp("rattling"))).problem
+    backlash = next(h for h in catalogue(problem.structure) if h.key == ("backlash", "shoulder_pan_joint"))
+    return problem, Model(problem.structure, problem.nominal), backlash, gap
+
+
+def cost_of(problem, model):
+    preds = predictions(problem, model, [None] * len(problem.groups), None)
+    return joint_costs(problem, preds, make_weights(problem, preds, 0.0)), preds
+
+
+@pytest.mark.parametrize("code", LAWS)
+@given(st.integers(0, 2**31), st.floats(-30.0, 30.0), st.floats(1e-4, 1e-2))
+@settings(max_examples=30, deadline=None)
+def test_the_mean_torque_is_met_and_the_law_is_the_law(code, seed, mean, size):
+    """Mean of ``k x + h`` is what was asked; without memory ``h`` follows from ``k x + h`` by the law's own form."""
+    a, b = LAWS[code]
+    rng, k = np.random.default_rng(seed), STIFFNESS
+    x = np.fft.irfft(np.r_[0.0, rng.normal(size=5) + 1j * rng.normal(size=5)], 400)[None]
+    x *= size / np.abs(x).max()
+    h = kernels.along_deflection(code, a, b, k, x, np.array([mean]), 60)
+    # The offset is the one at which the law gives this torque: here found again from the law at a point.
+    low, high = -1.0, 1.0
+    for _ in range(80):
+        offset = 0.5 * (low + high)
+        there = kernels.along_deflection(code, a, b, k, x + offset, np.array([0.0]), 0)
+        low, high = (low, offset) if np.mean(k * (x + offset) + there) > mean else (offset, high)
+    assert h == pytest.approx(there, abs=1e-6 * k * size + 1e-6)
+    if code == kernels.BACKLASH:
+        assert np.mean(k * (x + offset) + h) == pytest.approx(mean, abs=1e-6) or np.abs(x + offset).max() <= 0.5 * a
+        assert h == pytest.approx(-k * np.clip(x + offset, -0.5 * a, 0.5 * a), abs=1e-5)
+    if code == kernels.CUBIC:
+        assert h == pytest.approx(a * (x + offset) ** 3, abs=1e-6)
+
+
+def test_a_law_that_is_nothing_leaves_what_the_loop_leaves(clean):
+    """The residual along the record is that of the linear gear where the dead band has no width, but for the geometry
+    along a slightly other motion of the links."""
+    data, drives = clean
+    problem = set_up(data).problem
+    names = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
+    model = Model(problem.structure, replace(problem.nominal, **{k: drives[v] for k, v in names.items()}))
+    backlash = next(h for h in catalogue(problem.structure) if h.key == ("backlash", "shoulder_pan_joint"))
+    nothing = Effect(backlash, np.array([1e-9]))
+    (_, loop), (_, along) = (
+        cost_of(problem, replace(model, effects=(replace(nothing, hypothesis=h),))) for h in (backlash, along_record(backlash))
+    )
+    for a, b, group in zip(loop, along, problem.groups, strict=True):
+        if group.window is None:
+            left = [(group.U - x.U)[:, 1 : group.n_compared, 0] for x in (a, b)]
+            assert np.linalg.norm(left[0] - left[1]) < 0.05 * np.linalg.norm(left[0])
+
+
+def test_a_gear_that_rattles_is_explained_along_its_record_alone(rattling):
+    """At the true parameters the loop ends in other steady states than the recording; the width is found along it."""
+    problem, model, backlash, gap = rattling
+    along, count = along_record(backlash), sum(g.n_compared * 2 * len(g.segments) for g in problem.groups)
+    of_loop, of_record = (
+        cost_of(problem, replace(model, effects=(Effect(h, np.array([gap])),)))[0] for h in (backlash, along)
+    )
+    assert of_record.max() < 5.0 * count and of_loop[0] > 1e3 * count
+    start = replace(model, effects=(Effect(along, np.array([0.7 * gap])),))
+    result = fit(problem, start, iterations=15)
+    assert result.model.effects[0].p[0] == pytest.approx(gap, rel=0.02)
+    kept, _ = simulated(problem, along, result)
+    assert is_along_record(kept) and not is_along_record(as_loop(kept))
+
+
+def test_a_gear_with_one_steady_motion_ends_as_a_loop(tmp_path):
+    """A weak hardening spring is simulated in the end; a strong one bends its resonance over, and is not."""
+    ur10 = load_robot("ur10")
+    for cubic, along in ((2e8, False), (4e9, True)):
+        hidden = [parse_effect(f"hardening_stiffness@elbow_joint:cubic={cubic}", ur10)]
+        problem = set_up(through_files(run_experiment(small_plan(ur10, 8), hidden, seed=8), tmp_path / str(along))).problem
+        h = along_record(next(h for h in catalogue(problem.structure) if h.key == ("hardening_stiffness", "elbow_joint")))
+        start = Model(problem.structure, problem.nominal, (Effect(h, np.array([0.7 * cubic])),))
+        found, result = simulated(problem, h, fit(problem, start, iterations=15))
+        assert is_along_record(found) == along
+        assert result.model.effects[0].p[0] == pytest.approx(cubic, rel=0.02)
+        assert result.chi2_per_dof < (1.6 if along else 1.1)
