@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from ident.dataset_io import load_dataset, save_dataset
     from ident.diagnose import diagnose, diagnose_fully, identify
     from ident.frf import estimate_frf
+    from ident.show.simulated_gain import simulated_gain
 
 _HOMES = {
     "Dataset": "ident.dataset",
@@ -19,6 +20,7 @@ _HOMES = {
     "diagnose_fully": "ident.diagnose",
     "identify": "ident.diagnose",
     "estimate_frf": "ident.frf",
+    "simulated_gain": "ident.show.simulated_gain",
 }
 
 
@@ -40,4 +42,5 @@ __all__ = [
     "identify",
     "load_dataset",
     "save_dataset",
+    "simulated_gain",
 ]

@@ -255,6 +255,7 @@ def diagnose_fully(
         seconds=time.perf_counter() - began,
         next_plan=separating.plan if separating else None,
         inertias=problem.structure.inertias,
+        timing=result.final.model.par.timing,
         candidates=tuple(
             tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
         ),

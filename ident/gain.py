@@ -50,19 +50,24 @@ def segment_errors(
         names += group.segments
         for store, pred in ((out[0], a), (out[1], b)):
             e = group.observe(group.U - pred.U)
-            store.append(_power(np.abs(e) ** 2) / share)
-        out[2].append(np.repeat(_power(noise[None]) / share, len(group.segments), axis=0))
+            store.append(mean_squares(np.abs(e) ** 2) / share)
+        out[2].append(np.repeat(mean_squares(noise[None]) / share, len(group.segments), axis=0))
     joined = (np.concatenate(x) if x else np.zeros((0, len(problem.nominal.stiffness))) for x in out)
     return Errors(tuple(names), *joined), pairs
 
 
-def _power(lines: np.ndarray) -> np.ndarray:
+def mean_squares(lines: np.ndarray) -> np.ndarray:
     """Mean squares (S, n) of signals from the squared moduli (S, K, n) of their lines, line 0 first."""
     return lines[:, 0] + 2 * lines[:, 1:].sum(axis=1)
 
 
 def measure_gain(
-    errors: Errors, joints: tuple[str, ...], affected: Sequence[int], method: str, rng: np.random.Generator
+    errors: Errors,
+    joints: tuple[str, ...],
+    affected: Sequence[int],
+    method: str,
+    rng: np.random.Generator,
+    metric: str = METRIC,
 ) -> Gain | None:
     """Rms errors, share of the gap to the noise floor that is closed, and its 95 % interval.
 
@@ -94,5 +99,5 @@ def measure_gain(
         ratio = (b - a) / np.maximum(b - f, 1e-300)
         interval = tuple(float(v) for v in np.quantile(ratio, [0.025, 0.975]))
     return Gain(
-        errors.segments, METRIC, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints)
+        errors.segments, metric, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints)
     )

@@ -189,7 +189,8 @@ class FrfView:
 class Diagnosis:
     """Everything a report or recording shows.
 
-    ``inertias`` of bodies by joint of the description, where they were found; ``parameters`` of the drives.
+    ``inertias`` of bodies by joint of the description, where they were found; ``parameters`` of the drives; ``timing``, s:
+    delay of the torque against its record that the hold does not explain.
     """
 
     verdict: Verdict
@@ -204,6 +205,7 @@ class Diagnosis:
     candidates: tuple[tuple[tuple[str, str, float], ...], ...] = field(default=())
     next_plan: Plan | None = None
     inertias: dict[str, pin.Inertia] = field(default_factory=dict)
+    timing: float = 0.0
 
 
 def _plain(x: Any) -> Any:

@@ -152,7 +152,8 @@ def test_effects_at_one_joint_add_up(ur10):
     model = mujoco.MjModel.from_xml_string(_xml(ur10, causes))
     data = mujoco.MjData(model)
     link, motor = model.joint("link:elbow_joint"), model.joint("motor:elbow_joint")
-    assert model.dof_frictionloss[motor.dofadr[0]] == pytest.approx(3.0)
+    assert model.dof_frictionloss[motor.dofadr[0]] == pytest.approx(2.0)
+    assert model.nu == 6 and model.nactuator == 8  # beside the drives: an offset of friction, a bristle
     data.qpos[link.qposadr[0]] = data.qpos[motor.qposadr[0]] = 0.5
     mujoco.mj_forward(model, data)
     assert data.qfrc_passive[link.dofadr[0]] == pytest.approx(-(60.0 * (0.5 - 0.3) + 30.0 * 0.5), rel=1e-5)
@@ -184,6 +185,11 @@ def test_effects_at_one_joint_add_up(ur10):
         cause("transverse_elasticity", "elbow_joint", stiffness=2e4, damping=20.0, axis_x=1.0, axis_y=0.0, axis_z=0.0),
         cause("base_elasticity", "base", stiffness=5e5, damping=500.0, axis_x=1.0, axis_y=0.0, axis_z=0.0),
         cause("cogging", "elbow_joint", amplitude=1.0, periods_per_rev=101.0, phase=0.2),
+        cause("stribeck_friction", "elbow_joint", coulomb=2.0, static=3.0, stribeck_velocity=0.03),
+        cause("presliding_friction", "elbow_joint", stiffness=1e3, coulomb=2.0),
+        cause("hysteresis", "elbow_joint", stiffness=1e4, yield_torque=2.0),
+        cause("sensor_delay", "elbow_joint", delay=0.002),
+        cause("load_dependent_friction", "elbow_joint", coefficient=0.05),
     ],
     ids=lambda c: c.effect,
 )
@@ -199,7 +205,7 @@ def test_every_effect_is_exported_into_a_model_that_compiles_and_runs(ur10, made
     assert mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TEXT, 0) == "simgap.effect.0"
     note = bytes(model.text_data).decode()
     assert note.startswith(f"{made.effect} at {made.joint}, probability 0.970")
-    assert ("not simulated" in note) == (made.effect == "cogging")
+    assert ("not simulated" in note) == (made.effect == "load_dependent_friction")
 
 
 @pytest.fixture

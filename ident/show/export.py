@@ -16,7 +16,14 @@ from ident.show.figures import unit_suffix
 from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
 
-TIMESTEP = 2.5e-4
+TIMESTEP = 2.5e-4  # s, with the Runge-Kutta integrator
+FINE_TIMESTEP = 5e-5  # s, with the implicit integrator: stiff bristles upset the stages of Runge-Kutta
+MOST_REFINED = 10  # at most this many times finer where a delay or a lag is shorter than a step
+BRISTLE = 0.7  # frequency of a bristle that stands for a sign, over the step rate, rad
+TIGHT = [0.999, 0.999, 0.001, 0.5, 2.0]  # impedance of dry friction: hardly any creep
+NO_INPUT = int(mujoco.mjtCtrlInput.mjINPUT_NONE)
+PASSIVE_GROUP = 1  # of actuators without input
+TORQUE_OFFSET = "torque_offset"
 ROTOR_MASS = 1e-3  # kg, of a sphere of 50 mm: a body must have a mass; its inertia is taken off the armature
 ROTOR_BODY = 0.4 * ROTOR_MASS * 0.05**2
 
@@ -54,6 +61,9 @@ def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
 def write_mjcf(diagnosis: Diagnosis, path: Path) -> None:
     """MJCF of the extended model."""
     spec = build_mjcf(diagnosis.robot, diagnosis.parameters, diagnosis.verdict.causes, diagnosis.inertias)
+    baseline = diagnosis.verdict.baseline
+    offsets = {k.split(".", 1)[1]: v.value for k, v in baseline.items() if k.startswith(f"{TORQUE_OFFSET}.")}
+    note_record(spec, diagnosis.timing, offsets)
     spec.compile()
     path.write_text(spec.to_xml(), encoding="utf-8")
 
@@ -69,7 +79,8 @@ def build_mjcf(
     Bodies are written from the Pinocchio chain. A motor is a rotor beside the chain; a fixed
     tendon of length ``q_motor - q_link`` is its gear. Effects are native elements where MuJoCo has
     them. All are kept as ``<custom>`` numbers ``simgap.<i>.<effect>.<place>.<parameter>`` and a text
-    ``simgap.effect.<i>`` that says which element stands for the effect, if one does.
+    ``simgap.effect.<i>`` that says which element stands for the effect, if one does. Delays, lags and
+    friction are exact under the time step and the integrator of the file.
 
     Args:
         parameters: by the names of ``ident.graybox.parameter_names``.
@@ -91,8 +102,7 @@ def build_mjcf(
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
     spec.compiler.degree = False  # else angles such as springref are taken as degrees
-    spec.option.timestep = TIMESTEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    spec.option.timestep, spec.option.integrator = _stepping(causes)
     spec.option.gravity = list(robot.gravity)
     springs = {f"elasticity:{h.name}": h for h in (*hinges, *hidden)}
     _add_bodies(spec, structure.model, springs)
@@ -101,10 +111,11 @@ def build_mjcf(
     for i, cause in enumerate(causes):
         _note_effect(spec, i, cause)
         if cause.joint in robot.joint_names:
-            _add_effect(spec, robot, cause)
+            _add_effect(spec, i, cause)
     for (source, target), ratio in _couplings(robot, causes).items():
-        for kind in ("gear", "outer"):
-            tendon = spec.tendon(f"{kind}:{target}")
+        slips = [f"slip:{i}" for i, c in enumerate(causes) if c.effect == "hysteresis" and c.joint == target]
+        for name in (f"gear:{target}", f"outer:{target}", *slips):
+            tendon = spec.tendon(name)
             if tendon is not None:
                 tendon.wrap_joint(f"motor:{source}", ratio)
     return spec
@@ -191,16 +202,18 @@ def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> 
 
 
 NATIVE = {
-    "coulomb_friction": "frictionloss of motor:{place}, symmetric",
-    "stribeck_friction": "frictionloss of motor:{place} at the Coulomb level, without the dip",
-    "presliding_friction": "frictionloss of motor:{place} at the Coulomb level, without the bristle",
+    "coulomb_friction": "frictionloss of motor:{place} and, where it is asymmetric, passive:{index}",
+    "stribeck_friction": "bristle of passive:{index}, as stiff as the time step allows",
+    "presliding_friction": "bristle of passive:{index}",
+    "cogging": "cogging of passive:{index}",
     "torque_constant": "gear of drive:{place}",
-    "torque_lag": "exact first-order filter of drive:{place}",
+    "torque_lag": "first-order filter of drive:{place}",
     "torque_delay": "delay of drive:{place}",
     "torque_saturation": "forcerange of drive:{place}",
     "hardening_stiffness": "cubic stiffness of gear:{place}",
     "softening_stiffness": "gear:{place} and, with a dead band, outer:{place}",
     "backlash": "springlength of gear:{place}",
+    "hysteresis": "spring of slip:{index}, which yields",
     "gravity_spring": "spring of link:{place}",
     "dress_pack": "spring and frictionloss of link:{place}",
     "joint_coupling": "motor:{place} in the gear of the next joint",
@@ -208,6 +221,7 @@ NATIVE = {
     "link_inertia": "inertia of the body",
     "transverse_elasticity": "hinge elasticity:{effect}:{place}:{index}",
     "base_elasticity": "hinge elasticity:{effect}:{place}:{index}",
+    "sensor_delay": "delay of sensor encoder:{index}",
 }
 
 
@@ -233,23 +247,76 @@ def _couplings(robot: Robot, causes: Sequence[Cause]) -> dict[tuple[str, str], f
     return out
 
 
-def _add_effect(spec: mujoco.MjSpec, robot: Robot, cause: Cause) -> None:
+def _stepping(causes: Sequence[Cause]) -> tuple[float, mujoco.mjtIntegrator]:
+    """Time step (s) and integrator under which the elements of the effects hold.
+
+    The force of a bristle in the inner stages of Runge-Kutta runs away where it relaxes within a step
+    and its level changes with velocity; the implicit integrator has no such stages. A filter is stable
+    with Runge-Kutta, and a delay read from past samples alone, where they last longer than a step.
+    """
+    if any(c.effect == "stribeck_friction" for c in causes):
+        return FINE_TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    parts = [1.0]
+    for c in causes:
+        if c.effect == "torque_delay":
+            parts.append(1.5 * TIMESTEP / c.parameters["delay"].value)
+        elif c.effect == "torque_lag":
+            parts.append(TIMESTEP / c.parameters["time_constant"].value)
+    return TIMESTEP / min(int(np.ceil(max(parts))), MOST_REFINED), mujoco.mjtIntegrator.mjINT_RK4
+
+
+def stage_lead(timestep: float, integrator: int) -> float:
+    """Time by which a step sees an input on average ahead of its beginning, s.
+
+    Runge-Kutta reads a delayed input at the times of its stages, half a step late on average, where the
+    true input is held over the step.
+    """
+    return 0.5 * timestep if integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.0
+
+
+def note_record(spec: mujoco.MjSpec, timing: float, offsets: dict[str, float]) -> None:
+    """What the recorded torque has beyond that of the motors: numbers ``simgap.record.*``.
+
+    Args:
+        timing: delay of the torque against its record that the hold does not explain, s.
+        offsets: constant errors of the recorded torque by joint, N m.
+    """
+    for key, value in {"timing": timing, **{f"{TORQUE_OFFSET}.{k}": v for k, v in offsets.items()}}.items():
+        if value:
+            number = spec.add_numeric(name=f"simgap.record.{key}")
+            number.data, number.size = [float(value)], 1
+
+
+def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
     """Native elements of an effect at a joint, on top of those of effects before it."""
     p = {k: v.value for k, v in cause.parameters.items()}
     name = cause.joint
     motor, link = spec.joint(f"motor:{name}"), spec.joint(f"link:{name}")
     gear, drive = spec.tendon(f"gear:{name}"), spec.actuator(f"drive:{name}")
+    step = spec.option.timestep
     if cause.effect == "coulomb_friction":
-        motor.frictionloss += p["torque"]
-    elif cause.effect in ("stribeck_friction", "presliding_friction"):
-        motor.frictionloss += p["coulomb"]
+        _add_friction(motor, p["torque"], step)
+        bias = p["torque"] * p.get("asymmetry", 0.0)
+        if bias:
+            _add_passive(spec, index, name, cogging=[-bias, 0.0, 0.5 * np.pi])
+    elif cause.effect == "stribeck_friction":
+        stiffness = motor.armature * (BRISTLE / step) ** 2
+        static = max(p["static"], p["coulomb"])
+        _add_passive(spec, index, name, lugre=[stiffness, 0.0, p["coulomb"], static, p["stribeck_velocity"]])
+    elif cause.effect == "presliding_friction":
+        _add_passive(spec, index, name, lugre=[p["stiffness"], 0.0, p["coulomb"], p["coulomb"], 1.0])
+    elif cause.effect == "cogging":
+        _add_passive(spec, index, name, cogging=[-p["amplitude"], p["periods_per_rev"], p.get("phase", 0.0)])
     elif cause.effect == "torque_constant":
         drive.gear = [drive.gear[0] * p["scale"], 0, 0, 0, 0, 0]
     elif cause.effect == "torque_delay":
-        drive.delay += p["delay"]
-        drive.nsample = int(np.ceil(drive.delay / TIMESTEP)) + 2
+        lead = 0.0 if drive.delay else stage_lead(step, spec.option.integrator)
+        drive.delay += p["delay"] + lead
+        # Linear between past steps: over a step in which the input changes it delivers the mean.
+        drive.interp, drive.nsample = 1, int(np.ceil(drive.delay / step)) + 2
     elif cause.effect == "torque_lag":
-        drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+        exact = spec.option.integrator != mujoco.mjtIntegrator.mjINT_RK4
+        drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
         drive.dynprm = [p["time_constant"], *([0] * (len(drive.dynprm) - 1))]
     elif cause.effect == "torque_saturation":
         drive.forcelimited, drive.forcerange = True, [-p["limit"], p["limit"]]
@@ -261,13 +328,45 @@ def _add_effect(spec: mujoco.MjSpec, robot: Robot, cause: Cause) -> None:
         k = float(gear.stiffness[0])
         low = min(p["low_stiffness"], k)
         gear.stiffness = [low, 0, gear.stiffness[2]]
-        outer = spec.add_tendon(name=f"outer:{name}")
-        outer.wrap_joint(f"motor:{name}", 1.0)
-        outer.wrap_joint(f"link:{name}", -1.0)
-        outer.stiffness, outer.springlength = [k - low, 0, 0], [-p["transition"], p["transition"]]
+        _add_parallel(spec, f"outer:{name}", name, k - low, p["transition"])
+    elif cause.effect == "hysteresis":
+        slip = _add_parallel(spec, f"slip:{index}", name, p["stiffness"], 0.0)
+        slip.springyield = p["yield_torque"] / p["stiffness"]
     elif cause.effect in ("gravity_spring", "dress_pack"):
         _add_spring(link, p["stiffness"], p.get("rest_angle", 0.0))
-        link.frictionloss += p.get("friction", 0.0)
+        if p.get("friction", 0.0) > 0:
+            _add_friction(link, p["friction"], step)
+    elif cause.effect == "sensor_delay":
+        side = "link" if cause.channel == "q_link" else "motor"
+        sensor = spec.add_sensor(name=f"encoder:{index}", type=mujoco.mjtSensor.mjSENS_JOINTPOS)
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_JOINT, f"{side}:{name}"
+        sensor.delay, sensor.interp = p["delay"], 1
+        sensor.nsample = int(np.ceil(p["delay"] / step)) + 2
+
+
+def _add_friction(joint: mujoco.MjsJoint, torque: float, step: float) -> None:
+    """Dry friction that turns as sharply as the step allows; MuJoCo's default turns over 0.01 s of sliding."""
+    joint.frictionloss += torque
+    joint.solref_friction, joint.solimp_friction = [2.0 * step, 1.0], TIGHT
+
+
+def _add_passive(spec: mujoco.MjSpec, index: int, joint: str, **parts: list[float]) -> None:
+    """A motor without windings or input: its cogging or its bristle (LuGre) alone acts on the joint.
+
+    Cogging of no periods is a constant torque.
+    """
+    passive = spec.add_actuator(name=f"passive:{index}", target=f"motor:{joint}")
+    passive.trntype, passive.group = mujoco.mjtTrn.mjTRN_JOINT, PASSIVE_GROUP
+    passive.set_to_dcmotor(motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=NO_INPUT, **parts)
+
+
+def _add_parallel(spec: mujoco.MjSpec, name: str, joint: str, stiffness: float, free: float) -> mujoco.MjsTendon:
+    """A spring beside the gear of a joint with a dead band of ``free`` rad on either side."""
+    spring = spec.add_tendon(name=name)
+    spring.wrap_joint(f"motor:{joint}", 1.0)
+    spring.wrap_joint(f"link:{joint}", -1.0)
+    spring.stiffness, spring.springlength = [stiffness, 0, 0], [-free, free]
+    return spring
 
 
 def _add_spring(joint: mujoco.MjsJoint, stiffness: float, rest: float) -> None:

@@ -1,0 +1,120 @@
+"""Gain of an exported model: both models simulated in MuJoCo, in closed loop, along held-out motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from ident.dataset import Dataset
+from ident.diagnose import SEED, identify, with_held_out
+from ident.extended import Model, predict
+from ident.gain import Errors, mean_squares, measure_gain
+from ident.graybox import parameter_names
+from ident.parallel import one_thread_each
+from ident.records import Group
+from ident.reporting import affected_joints
+from ident.show.export import build_mjcf, note_record
+from ident.show.replay import load_arm, replay
+from ident.torque_fit import Problem, noise_covariance, predictions
+from ident.verdict import Gain
+from robot_assets.errors import DataError
+
+METRIC = "RMS error of the torque that the simulated motors need, N m"
+OF_SEGMENTS = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods")
+SEGMENTS = 4  # of each operating point that are simulated
+
+
+@one_thread_each
+def simulated_gain(
+    dataset: Dataset,
+    model: str | Path | mujoco.MjSpec,
+    *,
+    segments: int = SEGMENTS,
+    progress: Callable[[str], None] | None = None,
+) -> Gain | None:
+    """Gain of an exported model over the identified one without effects, by simulation of both.
+
+    The metric is that of the verdict's gain (``ident.gain``), with the torque of the simulated arms in the place of
+    predictions (``ident.show.replay``); the noise floor is the same.
+
+    Args:
+        dataset: with held-out segments, or a single motion whose end is held out.
+        model: ``model.xml`` of a diagnosis of it.
+        segments: of each operating point that are simulated, at most.
+        progress: told in a line what is done.
+
+    Returns:
+        The gain, None where no held-out segment can be followed.
+
+    Raises:
+        DataError: where the dataset has no held-out segments.
+    """
+    dataset = with_held_out(dataset)
+    setup, baseline = identify(dataset, progress=progress)
+    if not setup.held_out:
+        raise DataError("segments", dataset.name, "none of role validation", "at least one to simulate")
+    problem = setup.problem
+    groups = tuple(subset(g, spread(len(g.segments), segments)) for g in setup.held_out)
+    affected = affected_joints(problem, baseline, predictions(problem, baseline.model, baseline.remainders))
+    if progress is not None:
+        progress("simulation of both models")
+    errors = simulated_errors(problem, groups, baseline.model, export_baseline(baseline.model), model)
+    rng = np.random.default_rng(SEED)
+    return measure_gain(errors, dataset.joints, affected, "simulated in closed loop", rng, METRIC)
+
+
+def export_baseline(model: Model) -> mujoco.MjSpec:
+    """MJCF of a model without effects, with what the record of its torque has beyond it."""
+    robot = model.structure.robot
+    values = dict(zip(parameter_names(robot), np.exp(model.par.to_log()), strict=True))
+    spec = build_mjcf(robot, values, inertias=model.structure.inertias)
+    note_record(spec, model.par.timing, {})
+    return spec
+
+
+def simulated_errors(
+    problem: Problem,
+    groups: Sequence[Group],
+    noise_of: Model,
+    before: str | Path | mujoco.MjSpec,
+    after: str | Path | mujoco.MjSpec,
+) -> Errors:
+    """Errors of the torque that two simulated arms need, in the compared band; a group that one loses is left out.
+
+    Args:
+        noise_of: the model by which noise of the position counts as torque.
+    """
+    joints = problem.structure.robot.joint_names
+    arms = [load_arm(x, joints, problem.sampling.sample_time) for x in (before, after)]
+    names: list[str] = []
+    out: list[list[np.ndarray]] = [[], [], []]
+    for group in groups:
+        share = 1.0 if group.window is None else float(np.mean(group.window**2))
+        try:
+            needed = [replay(arm, group, problem.sampling).U for arm in arms]
+            noise = noise_covariance(problem, group, predict(noise_of, group, problem.sampling))
+        except FloatingPointError:
+            continue
+        names += group.segments
+        for store, U in zip(out, needed):
+            store.append(mean_squares(np.abs(group.observe(group.U - U)) ** 2) / share)
+        floor = mean_squares(np.einsum("kii->ki", noise).real[None])
+        out[2].append(np.repeat(floor, len(group.segments), axis=0))
+    joined = (np.concatenate(x) if x else np.zeros((0, len(joints))) for x in out)
+    return Errors(tuple(names), *joined)
+
+
+def spread(count: int, most: int) -> np.ndarray:
+    """At most ``most`` of ``count`` indices, over the whole range."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def subset(group: Group, index: np.ndarray) -> Group:
+    """Some segments of a group."""
+    parts = {name: getattr(group, name) for name in OF_SEGMENTS}
+    chosen = {name: None if x is None else x[index] for name, x in parts.items()}
+    return replace(group, segments=tuple(group.segments[i] for i in index), **chosen)

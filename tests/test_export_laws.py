@@ -1,0 +1,133 @@
+"""Elements of the exported model against the laws that they stand for."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from ident.hypotheses.kernels import bristle, elastoplastic
+from ident.show.export import build_mjcf
+from robot_assets.robot import load_robot
+from tests.test_show import cause, parameters
+
+JOINT = "drive"
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """Two inertias: one motor, gravity without effect."""
+    return load_robot("twomass")
+
+
+def exported(robot, *causes):
+    """Model and data, through the text of the file."""
+    spec = build_mjcf(robot, parameters(robot), causes)
+    spec.compile()
+    model = mujoco.MjModel.from_xml_string(spec.to_xml())
+    return model, mujoco.MjData(model)
+
+
+def forced(model, data, q, v):
+    """Forces of the elements of a motor (T,) whose state is set to ``q``, ``v`` (T,), step by step; gear and damper taken off."""
+    j, k = model.joint(f"motor:{JOINT}").dofadr[0], model.joint(f"link:{JOINT}").dofadr[0]
+    model.tendon_stiffness[0], model.tendon_damping[0], model.dof_damping[j] = 0.0, 0.0, 0.0
+    out = []
+    for qi, vi in zip(q, v):
+        data.qpos[j], data.qvel[j], data.qpos[k], data.qvel[k] = qi, vi, 0.0, 0.0
+        mujoco.mj_forward(model, data)
+        out.append(data.qfrc_actuator[j] + data.qfrc_passive[j] + data.qfrc_constraint[j])
+        mujoco.mj_step(model, data)
+    return np.array(out)
+
+
+def swing(model, amplitude, frequency, turns=2.0):
+    """Time, position and velocity of a slow swing on the grid of the model."""
+    t = np.arange(0, turns / frequency, model.opt.timestep)
+    w = 2 * np.pi * frequency
+    return t, amplitude * np.sin(w * t), amplitude * w * np.cos(w * t)
+
+
+def test_cogging_is_a_sine_of_the_motor_angle(bench):
+    model, data = exported(bench, cause("cogging", JOINT, amplitude=0.5, periods_per_rev=101.3, phase=0.4))
+    q = np.linspace(-3, 3, 50)
+    assert np.allclose(forced(model, data, q, 0 * q), -0.5 * np.sin(101.3 * q + 0.4), atol=1e-12)
+
+
+def test_coulomb_friction_is_asymmetric_and_turns_within_a_step(bench):
+    model, data = exported(bench, cause("coulomb_friction", JOINT, torque=0.3, asymmetry=0.2))
+    turn = 0.3 / parameters(bench)[f"motor_inertia.{JOINT}"] * model.opt.timestep
+    v = np.array([-2.0, -1.0, 1.0, 2.0]) * 2 * turn
+    assert np.allclose(forced(model, data, 0 * v, v), [0.24, 0.24, -0.36, -0.36], rtol=1e-3)
+    _, data = exported(bench, cause("coulomb_friction", JOINT, torque=0.3))
+    data.ctrl[0] = 0.29  # less than the friction: the motor creeps by a thousandth of what it would do
+    model, _ = exported(bench, cause("coulomb_friction", JOINT, torque=0.3))
+    model.tendon_stiffness[0] = model.tendon_damping[0] = 0.0
+    for _ in range(400):
+        mujoco.mj_step(model, data)
+    j = model.joint(f"motor:{JOINT}").dofadr[0]
+    assert abs(data.qvel[j]) < 0.29 / model.dof_M0[j] * model.opt.timestep * 1e-2
+
+
+def test_presliding_friction_is_the_dahl_law(bench):
+    model, data = exported(bench, cause("presliding_friction", JOINT, stiffness=100.0, coulomb=0.3))
+    _, q, v = swing(model, 0.02, 2.0)
+    law = 0.3 * bristle(v[None], model.opt.timestep, 0.3 / 100.0)[0]
+    half = len(q) // 2
+    assert np.abs(forced(model, data, q, v) + law)[half:].max() < 0.02 * 0.3
+
+
+def test_stribeck_friction_falls_with_velocity(bench):
+    model, data = exported(bench, cause("stribeck_friction", JOINT, coulomb=0.2, static=0.5, stribeck_velocity=0.1))
+    t, q, v = swing(model, 0.05, 1.0)
+    law = np.sign(v) * (0.2 + 0.3 * np.exp(-((v / 0.1) ** 2)))
+    slides = (np.abs(v) > 0.02) & (t > 1.0)  # beyond the breakaway distance of the bristle
+    assert np.allclose(forced(model, data, q, v)[slides], -law[slides], rtol=2e-3)
+
+
+def test_hysteresis_is_maxwell_slip(bench):
+    model, data = exported(bench, cause("hysteresis", JOINT, stiffness=80.0, yield_torque=0.2))
+    _, q, v = swing(model, 0.01, 2.0)
+    law = elastoplastic(q[None], 80.0, 0.2)[0]
+    got = forced(model, data, q, v)
+    # The state is set, so that a step that MuJoCo takes before the next one is not part of the path.
+    half = len(q) // 2
+    assert np.abs(got + law)[half:].max() < 0.02 * 0.2
+
+
+@pytest.mark.parametrize("delay", [1e-4, 4e-4, 1.07e-3])
+def test_a_delayed_drive_acts_late_by_the_delay(bench, delay):
+    """A unit step of torque on the bare rotor: it lags the undelayed one by the delay times the acceleration."""
+    model, data = exported(bench, cause("torque_delay", JOINT, delay=delay))
+    lag = lost_time(model, data)
+    assert lag == pytest.approx(delay, rel=1e-3)
+
+
+@pytest.mark.parametrize("lag", [1e-4, 1e-3])
+def test_a_lagging_drive_loses_its_time_constant(bench, lag):
+    model, data = exported(bench, cause("torque_lag", JOINT, time_constant=lag))
+    assert lost_time(model, data) == pytest.approx(lag, rel=1e-2)
+
+
+def lost_time(model, data):
+    """Time by which the velocity of the free rotor is behind that of an immediate unit step of torque."""
+    j = model.joint(f"motor:{JOINT}").dofadr[0]
+    model.tendon_stiffness[0], model.tendon_damping[0], model.dof_damping[j] = 0.0, 0.0, 0.0
+    data.ctrl[0] = 1.0
+    while data.time < 0.02:
+        mujoco.mj_step(model, data)
+    return data.time - data.qvel[j] * model.dof_M0[j]
+
+
+def test_a_delayed_encoder_shows_an_earlier_position(bench):
+    model, data = exported(bench, cause("sensor_delay", JOINT, delay=1.1e-3))
+    j = model.joint(f"motor:{JOINT}").qposadr[0]
+    data.ctrl[0] = 1.0
+    shown, true, time = [], [], []
+    while data.time < 0.05:
+        mujoco.mj_forward(model, data)
+        shown.append(data.sensordata[0])
+        true.append(data.qpos[j])
+        time.append(data.time)
+        mujoco.mj_step(model, data)
+    shown, true, time = map(np.array, (shown, true, time))
+    late = time > 0.01
+    assert np.allclose(shown[late], np.interp(time[late] - 1.1e-3, time, true), rtol=1e-6)
