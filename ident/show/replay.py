@@ -44,7 +44,7 @@ class Arm:
         model: MuJoCo model; its step divides the sample time.
         motor: (n,) addresses of the rotors in qpos and qvel alike. drive: (n,) ids of the actuators.
         gear: (n,) torque delivered per torque commanded, in the steady state.
-        delay, lag: (n,) s, of the drives. sensor_delay: (n,) s, of the motor encoders.
+        limit: (n,) N m, on the command. delay, lag: (n,) s, of the drives. sensor_delay: (n,) s, of the motor encoders.
         timing, offset: s and (n,) N m, what the record of the torque has beyond the motors' own.
     """
 
@@ -52,6 +52,7 @@ class Arm:
     motor: np.ndarray
     drive: np.ndarray
     gear: np.ndarray
+    limit: np.ndarray
     delay: np.ndarray
     lag: np.ndarray
     sensor_delay: np.ndarray
@@ -93,10 +94,12 @@ def load_arm(source: str | Path | mujoco.MjSpec, joints: Sequence[str], sample_t
     old = spec.option.timestep
     step = sample_time / np.ceil(sample_time / old - 1e-9)
     lead = stage_lead(old, spec.option.integrator) - stage_lead(step, spec.option.integrator)
-    delay, gear, lag = np.zeros(len(joints)), np.ones(len(joints)), np.zeros(len(joints))
+    delay, lag, gear, limit = np.zeros(len(joints)), np.zeros(len(joints)), np.ones(len(joints)), np.full(len(joints), np.inf)
     for j, name in enumerate(joints):
         drive = spec.actuator(f"drive:{name}")
         gear[j] = drive.gear[0]
+        if drive.forcelimited == mujoco.mjtLimited.mjLIMITED_TRUE:
+            limit[j] = drive.forcerange[1]
         if drive.delay:
             drive.delay -= lead
             drive.nsample = int(np.ceil(drive.delay / step)) + 2
@@ -116,6 +119,7 @@ def load_arm(source: str | Path | mujoco.MjSpec, joints: Sequence[str], sample_t
         motor=np.array([int(model.joint(f"motor:{name}").qposadr[0]) for name in joints]),
         drive=np.array([model.actuator(f"drive:{name}").id for name in joints]),
         gear=gear,
+        limit=limit,
         delay=delay,
         lag=lag,
         sensor_delay=late,
@@ -259,16 +263,20 @@ class _Loop:
     def run(
         self, reference: np.ndarray, velocity: np.ndarray, forward: np.ndarray, substeps: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Follow references (S, T, n), one integration step each: loop torque (S, T, n), position at samples."""
-        motor, drives = self.arm.motor, self.arm.ctrl
+        """Follow references (S, T, n), one integration step each: loop torque (S, T, n), position at samples.
+
+        Torque beyond the limit of a drive is not delivered, and no motion tells it: there the record stands.
+        """
+        motor, drives, limit = self.arm.motor, self.arm.ctrl, self.arm.limit
         added = np.empty_like(reference)
         q = np.empty((len(reference), -(-reference.shape[1] // substeps), reference.shape[2]))
         for k in range(reference.shape[1]):
             at = self.q[:, motor]
             if k % substeps == 0:
                 q[:, k // substeps] = at
-            added[:, k] = self.kp * (reference[:, k] - at) + self.kd * (velocity[:, k] - self.v[:, motor])
-            self.ctrl[:, drives] = forward[:, k] + added[:, k]
+            torque = self.kp * (reference[:, k] - at) + self.kd * (velocity[:, k] - self.v[:, motor])
+            self.ctrl[:, drives] = torque + forward[:, k]
+            added[:, k] = np.clip(torque + forward[:, k], -limit, limit) - np.clip(forward[:, k], -limit, limit)
             self.batch.step()
         if not np.all(np.isfinite(q)) or np.abs(q - reference[:, ::substeps]).max() > LOST:
             raise FloatingPointError("the simulated arm loses the recorded motion")
