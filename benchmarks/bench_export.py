@@ -12,10 +12,9 @@ import time
 
 import numpy as np
 
-from ident.attribute import fit_baseline
 from ident.conclude import baseline_values, reported_parameters
 from ident.dataset import Dataset
-from ident.diagnose import set_up
+from ident.diagnose import identify
 from ident.excitation import operating_points
 from ident.extended import Effect, Model
 from ident.gain import measure_gain, segment_errors
@@ -29,6 +28,7 @@ from sim import draw_effect, run_experiment
 from sim.effects import EFFECTS, parameters_of
 from sim.experiment import plan_experiment
 
+STRENGTH = 1.0
 START = {"smoothing_velocity": 1e-3, "inertia": 1e-3, "reaction": 1.0, "viscous": 1.0, "com_x": 0.0, "com_y": 0.0, "com_z": 0.0}
 
 
@@ -43,6 +43,8 @@ def true_hypothesis(problem: Problem, effect) -> Effect:
     fits = [h for h in catalogue(problem.structure) if (h.effect, h.place) == (effect.name, effect.place)]
     if "axis" in truth:
         fits = [h for h in fits if tuple(h.options["axis"]) == tuple(truth["axis"])]
+    if not fits:
+        raise LookupError("no hypothesis of the torque equation")
     values = [float(truth.get(p.name, START.get(p.name, 1.0))) for p in fits[0].parameters]
     return Effect(fits[0], np.array(values))
 
@@ -60,15 +62,14 @@ def small_dataset(robot: Robot, name: str, seed: int, period: int, levels: tuple
     postures = operating_points(robot, 2, rng)
     options = {"points": 1, "validation_points": 1, "levels": levels, "seed": seed, "period": period, "trajectory": False}
     plan = plan_experiment(robot, postures, **options)
-    effect = draw_effect(rng, robot, names=(name,), strength=2.0)
+    effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH)
     return effect, run_experiment(plan, [effect], seed=seed)
 
 
 def both_gains(dataset: Dataset, effect, segments: int = 2) -> tuple[Gain, Gain]:
     """Gain by prediction and by simulation on the same segments, over the joints in which the effect shows."""
-    setup = set_up(dataset)
+    setup, baseline = identify(dataset)
     problem, robot = setup.problem, dataset.robot
-    baseline = fit_baseline(problem)
     result = fit(problem, Model(problem.structure, problem.nominal, (true_hypothesis(problem, effect),)))
     groups = tuple(subset(g, spread(len(g.segments), segments)) for g in setup.held_out)
     predicted, _ = segment_errors(problem, groups, baseline.model, result.model)
@@ -94,11 +95,16 @@ def main() -> None:
     print(f"{'effect':22s} {'place':20s} {'before':>9s} {'noise':>9s} {'predicted':>9s} {'simulated':>9s} {'difference':>10s}  seconds")
     for name in args.effects:
         began = time.perf_counter()
-        effect, data = small_dataset(robot, name, args.seed, args.period, tuple(args.levels))
+        # A seed of its own for each effect: places differ.
+        seed = args.seed + list(EFFECTS).index(name)
+        effect, data = small_dataset(robot, name, seed, args.period, tuple(args.levels))
         try:
             predicted, simulated = both_gains(data, effect)
         except (LookupError, FloatingPointError, np.linalg.LinAlgError) as err:
-            print(f"{name:22s} {effect.place:20s} {err!r}", flush=True)
+            print(f"{name:22s} {effect.place:20s} {err}", flush=True)
+            continue
+        if predicted is None or simulated is None:
+            print(f"{name:22s} {effect.place:20s} no segment followed by {'the prediction' if predicted is None else 'the simulation'}")
             continue
         closed = [g.gap_closed for g in (predicted, simulated)]
         shown = [f"{'no gap':>9s}" if c is None else f"{c:9.3f}" for c in closed]

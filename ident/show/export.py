@@ -102,7 +102,8 @@ def build_mjcf(
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
     spec.compiler.degree = False  # else angles such as springref are taken as degrees
-    spec.option.timestep, spec.option.integrator = _stepping(causes)
+    fastest = max(parameters[f"damping.{name}"] / parameters[f"motor_inertia.{name}"] for name in robot.joint_names)
+    spec.option.timestep, spec.option.integrator = _stepping(causes, fastest)
     spec.option.gravity = list(robot.gravity)
     springs = {f"elasticity:{h.name}": h for h in (*hinges, *hidden)}
     _add_bodies(spec, structure.model, springs)
@@ -203,7 +204,7 @@ def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> 
 
 NATIVE = {
     "coulomb_friction": "frictionloss of motor:{place} and, where it is asymmetric, passive:{index}",
-    "stribeck_friction": "bristle of passive:{index}, as stiff as the time step allows",
+    "stribeck_friction": "bristle of passive:{index}, as stiff as the time step allows, for the turn of the sign",
     "presliding_friction": "bristle of passive:{index}",
     "cogging": "cogging of passive:{index}",
     "torque_constant": "gear of drive:{place}",
@@ -247,14 +248,15 @@ def _couplings(robot: Robot, causes: Sequence[Cause]) -> dict[tuple[str, str], f
     return out
 
 
-def _stepping(causes: Sequence[Cause]) -> tuple[float, mujoco.mjtIntegrator]:
+def _stepping(causes: Sequence[Cause], fastest: float) -> tuple[float, mujoco.mjtIntegrator]:
     """Time step (s) and integrator under which the elements of the effects hold.
 
-    The force of a bristle in the inner stages of Runge-Kutta runs away where it relaxes within a step
+    ``fastest`` is the rate at which a damper stops a rotor, 1/s: beyond the step rate it is for the implicit
+    integrator. The force of a bristle in the inner stages of Runge-Kutta runs away where it relaxes within a step
     and its level changes with velocity; the implicit integrator has no such stages. A filter is stable
     with Runge-Kutta, and a delay read from past samples alone, where they last longer than a step.
     """
-    if any(c.effect == "stribeck_friction" for c in causes):
+    if fastest * TIMESTEP > 1.0 or any(c.effect == "stribeck_friction" for c in causes):
         return FINE_TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     parts = [1.0]
     for c in causes:

@@ -203,13 +203,10 @@ def sampled_impedance(arm: Arm, rest: np.ndarray, hold: np.ndarray, omega: np.nd
     """Recorded torque per sampled motor position about rest, without delays; (L, n, n).
 
     Of ``x+ = A x + B u`` over one sample time, from differences of one integration step: the ``u`` that solves
-    ``z x = A x + B u, C x = q``, which stands where the arm moves freely too. Dry friction and the parts of
-    ``PASSIVE_GROUP`` are left out: at rest they would hold the arm.
+    ``z x = A x + B u, C x = q``, which stands where the arm moves freely too. Dry friction, cogging and bristles
+    are left out.
     """
-    model = copy.copy(arm.model)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
-    model.opt.disableactuator |= 1 << PASSIVE_GROUP
-    model.actuator_delay[:] = 0.0
+    model = _smooth(arm)
     data = mujoco.MjData(model)
     nq, nv = model.nq, model.nv
     filters = arm.filters
@@ -238,6 +235,35 @@ def sampled_impedance(arm: Arm, rest: np.ndarray, hold: np.ndarray, omega: np.nd
     return np.linalg.solve(system, np.broadcast_to(right, (len(omega), *right.shape)))[:, size:]
 
 
+def felt_inertia(arm: Arm, rest: np.ndarray) -> np.ndarray:
+    """Inertia that each motor moves within an integration step, dry friction apart; (n,) kg m2.
+
+    That of the rotor, and of the link too where a damper ties them together.
+    """
+    model = _smooth(arm)
+    data = mujoco.MjData(model)
+
+    def speed(torque: np.ndarray) -> np.ndarray:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = rest
+        data.qfrc_applied[arm.motor] = torque
+        mujoco.mj_step(model, data)
+        return data.qvel[arm.motor].copy()
+
+    unit = np.eye(len(arm.motor))
+    gained = [(speed(e) - speed(-e))[j] / 2.0 for j, e in enumerate(unit)]
+    return model.opt.timestep / np.array(gained)
+
+
+def _smooth(arm: Arm) -> mujoco.MjModel:
+    """The arm without delays, dry friction and the parts of ``PASSIVE_GROUP``, which at rest would hold it."""
+    model = copy.copy(arm.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+    model.opt.disableactuator |= 1 << PASSIVE_GROUP
+    model.actuator_delay[:] = 0.0
+    return model
+
+
 class _Loop:
     """Simulations of an arm side by side, each motor in a loop of its own; keeps the state between runs."""
 
@@ -257,7 +283,7 @@ class _Loop:
                     mujoco.mj_initCtrlHistory(arm.model, data, i, None, np.full(samples, torque))
             self.batch.bind("history")[:] = data.history
         frequency = LOOP / (arm.model.opt.timestep + arm.delay + arm.lag)
-        inertia = arm.model.dof_M0[arm.motor]
+        inertia = felt_inertia(arm, rest)
         self.kp, self.kd = inertia * frequency**2 / arm.gear, 2.0 * inertia * frequency / arm.gear
 
     def run(
