@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -96,6 +97,9 @@ def experiment(
     points: Annotated[int, typer.Option(min=1, help="Operating points for identification.")] = 2,
     drives: Annotated[str, typer.Option(help='"nominal", or "drawn" within a factor of two.')] = "nominal",
     plan: Annotated[Path | None, typer.Option(help="A plan written by `simgap design`, or next_plan.toml of a diagnosis.")] = None,
+    one_recording: Annotated[
+        bool, typer.Option("--one-recording", help="All operating points in one run, moves between them included; cut into the dataset.")
+    ] = False,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -115,10 +119,25 @@ def experiment(
     made = plan_from_toml(plan) if plan else _plan(arm, points, realizations, seed, (1.0, 0.5, 0.25))
     if made.robot.folder != arm.folder:
         raise DataError("--plan", str(plan), f"a plan for {made.robot.name}", f"one for {arm.name}")
+    run = {"seed": seed, "drives": figures, "name": out.name}
+    summary, text = {"dataset": str(out)}, ""
     with _progress(quiet or json_) as (_, share):
-        data = run_experiment(made, hidden, seed=seed, drives=figures, name=out.name, progress=share)
+        if one_recording:
+            data, spent = _one_recording(made, hidden, progress=share, **run)
+            summary["samples"], text = asdict(spent) | {"total": spent.total}, spent.text() + "\n"
+        else:
+            data = run_experiment(made, hidden, progress=share, **run)
     save_dataset(data, out)
-    _print({"dataset": str(out), "segments": len(data.segments)}, json_, f"{len(data.segments)} segments in {out}")
+    _print(summary | {"segments": len(data.segments)}, json_, f"{text}{len(data.segments)} segments in {out}")
+
+
+def _one_recording(plan, effects, **run):
+    """(dataset cut from one run of the plan, what its samples were spent on)."""
+    from ident.cutting import cut_recording, schedule_plan, usage
+    from sim.recording import run_recording
+
+    schedule = schedule_plan(plan)
+    return cut_recording(run_recording(schedule, effects, **run), schedule), usage(schedule)
 
 
 @app.command()

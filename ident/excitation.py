@@ -66,6 +66,11 @@ class Experiment:
     role: str
     r: np.ndarray
 
+    @property
+    def name(self) -> str:
+        """Name of its segment."""
+        return f"{self.operating_point}-a{self.amplitude:g}-e{self.experiment}-r{self.realization}"
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -86,6 +91,42 @@ class Plan:
     trajectories: tuple[Trajectory, ...]
     injection: str
     seed: int
+
+
+@dataclass(frozen=True)
+class Part:
+    """Samples ``start`` to ``stop`` of a long recording, and the experiment or motion run in them.
+
+    Attributes:
+        kind: "move", "settle", "experiment" or "trajectory".
+        source: what of the plan it is; None for what only leads there.
+    """
+
+    kind: str
+    start: int
+    stop: int
+    source: Experiment | Trajectory | None = None
+
+    @property
+    def samples(self) -> slice:
+        """Of the recording."""
+        return slice(self.start, self.stop)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """A whole plan as one recording of N samples (Wernholt and Moberg 2011, Figure 1); see ``ident.cutting``.
+
+    Attributes:
+        plan: what is run. parts: one after another, without gaps.
+        q_ref: (N, n) rad, posture or motion held by the loop, without the excitation.
+        r: (N, n) excitation, of the plan's ``injection``; zero where none runs.
+    """
+
+    plan: Plan
+    parts: tuple[Part, ...]
+    q_ref: np.ndarray
+    r: np.ndarray
 
 
 def odd_random_grid(
@@ -295,11 +336,16 @@ def _validation_motion(robot: Robot, postures: np.ndarray, rng: np.random.Genera
     stops.append(first)
     pieces = [np.repeat(first[None], int(0.5 * rate), axis=0)]
     for a, b in pairwise(stops):
-        duration = max(1.2, float(np.max(1.9 * np.abs(b - a) / (SPEED_SHARE * robot.array("velocity_limit")))))
-        u = np.linspace(0, 1, int(duration * rate), endpoint=False)[:, None]
-        pieces.append(a + (b - a) * (10 * u**3 - 15 * u**4 + 6 * u**5))
+        pieces.append(point_to_point(robot, a, b, rate))
         pieces.append(np.repeat(b[None], int(0.3 * rate), axis=0))
     return Trajectory("motion-1", np.concatenate(pieces), "validation")
+
+
+def point_to_point(robot: Robot, a: np.ndarray, b: np.ndarray, rate: float) -> np.ndarray:
+    """(N, n) rad from ``a`` to ``b`` (n,) by a fifth-order polynomial that keeps to ``SPEED_SHARE`` of the limits."""
+    duration = max(1.2, float(np.max(1.9 * np.abs(b - a) / (SPEED_SHARE * robot.array("velocity_limit")))))
+    u = np.linspace(0, 1, int(duration * rate), endpoint=False)[:, None]
+    return a + (b - a) * (10 * u**3 - 15 * u**4 + 6 * u**5)
 
 
 def plan_to_toml(plan: Plan, path: str | Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.excitation import LOOP_HZ, Experiment, Plan, make_plan
+from ident.excitation import LOOP_HZ, Plan, make_plan
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 from sim.loop import Controller, Noise, failed, run_loop
@@ -68,14 +68,10 @@ def run_experiment(
     Raises:
         DataError: where the loop diverges, or the step does not divide the sample time.
     """
-    robot, x = plan.robot, plan.excitation
-    if abs(1 / (x.sample_rate * timestep) - round(1 / (x.sample_rate * timestep))) > 1e-9:
-        raise DataError("timestep", "plant", f"{timestep:g} s", f"a whole fraction of {1 / x.sample_rate:g} s")
+    check_step(timestep, plan.excitation.sample_rate)
     rng = np.random.default_rng(seed)
-    plant = build_plant(robot, effects, drives=drives, timestep=timestep, integrator=integrator)
-    levels = Noise(
-        noise * robot.array("q_std"), noise * robot.array("tau_std"), PROCESS_SHARE * noise * robot.array("tau_std")
-    )
+    plant = build_plant(plan.robot, effects, drives=drives, timestep=timestep, integrator=integrator)
+    levels = noise_levels(plan.robot, noise)
     segments: list[Segment] = []
     share = len(plan.experiments) / max(len(plan.experiments) + len(plan.trajectories), 1)
     clock = 0.0
@@ -88,11 +84,17 @@ def run_experiment(
         clock = segments[-1].t[-1] + PAUSE
     if progress is not None:
         progress(1.0)
+    return as_dataset(plan, segments, name)
+
+
+def as_dataset(plan: Plan, segments: Sequence[Segment], name: str) -> Dataset:
+    """Segments recorded on the plant as a dataset."""
+    robot = plan.robot
     return Dataset(
         name=name,
         robot_ref=_reference(robot),
         robot=robot,
-        sample_rate=x.sample_rate,
+        sample_rate=plan.excitation.sample_rate,
         joints=robot.joint_names,
         input_hold="zoh",
         q_std=None,
@@ -102,13 +104,27 @@ def run_experiment(
     )
 
 
+def check_step(timestep: float, sample_rate: float) -> None:
+    """Raise a DataError where the step does not divide the sample time."""
+    steps = 1 / (sample_rate * timestep)
+    if abs(steps - round(steps)) > 1e-9:
+        raise DataError("timestep", "plant", f"{timestep:g} s", f"a whole fraction of {1 / sample_rate:g} s")
+
+
+def noise_levels(robot: Robot, factor: float) -> Noise:
+    """The noise of ``robot.toml`` times a factor."""
+    q, tau = factor * robot.array("q_std"), factor * robot.array("tau_std")
+    return Noise(q, tau, PROCESS_SHARE * tau)
+
+
 def _reference(robot: Robot) -> str:
     from robot_assets.robot import ASSETS
 
     return robot.name if (ASSETS / robot.name).resolve() == robot.folder else str(robot.folder)
 
 
-def _gains(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def loop_gains(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Proportional and derivative gain of a loop of ``LOOP_HZ`` around an inertia."""
     w = 2 * np.pi * LOOP_HZ
     return inertia * w**2, 2 * DAMPING_RATIO * inertia * w
 
@@ -122,7 +138,7 @@ def _multisines(
     for e in plan.experiments:
         if e.operating_point not in by_point:
             qpos, hold = rest(plant, e.q0)
-            by_point[e.operating_point] = qpos, hold, *_gains(link_inertia_diagonal(plant, e.q0))
+            by_point[e.operating_point] = qpos, hold, *loop_gains(link_inertia_diagonal(plant, e.q0))
     qpos, hold, kp, kd = (np.stack([by_point[e.operating_point][i] for e in plan.experiments]) for i in range(4))
     q0 = np.stack([e.q0 for e in plan.experiments])
     r = np.stack([e.r for e in plan.experiments])
@@ -138,7 +154,7 @@ def _multisines(
     t = np.arange(N) / x.sample_rate
     return [
         Segment(
-            name=_segment_name(e),
+            name=e.name,
             kind="multisine",
             role=e.role,
             t=start[s] + t,
@@ -160,17 +176,13 @@ def _multisines(
     ]
 
 
-def _segment_name(e: Experiment) -> str:
-    return f"{e.operating_point}-a{e.amplitude:g}-e{e.experiment}-r{e.realization}"
-
-
 def _motion(
     plant: Plant, plan: Plan, move, levels: Noise, rng: np.random.Generator, link_encoders: bool, clock: float
 ) -> Segment:
     ref = move.q_ref
     rate = plan.excitation.sample_rate
     inertia = link_inertia_diagonal(plant, ref[0])
-    kp, kd = _gains(inertia)
+    kp, kd = loop_gains(inertia)
     qpos, _ = rest(plant, ref[0])
     at = np.arange(0, len(ref), 20)
     coarse = np.stack([gravity_torque(plant, ref[k]) for k in at])

@@ -18,7 +18,8 @@ class Controller:
 
     Attributes:
         kp, ki, kd: (S, n) N m/rad, N m/(rad s), N m s/rad.
-        feed_forward: (S, n) N m, or (S, N, n) along a motion.
+        feed_forward: (S, n) N m.
+        All or some (S, N, n) instead, along a motion.
     """
 
     kp: np.ndarray
@@ -89,7 +90,6 @@ def run_loop(
     v_old = np.zeros((S, plant.model.nv))
     seen = {"q": x[:, m].copy(), "q_link": x[:, a].copy()}
     period = excitation.shape[1]
-    ff = controller.feed_forward
     for k in range(samples):
         show = {"q": x[:, m].copy(), "q_link": x[:, a].copy()}
         for j, channel, late, _ in measure:
@@ -104,8 +104,8 @@ def run_loop(
         velocity = 0.5 * velocity + 0.5 * ((y - ref) - (last - last_ref)) * sample_rate
         last, last_ref = y, ref
         integral += (ref - y) / sample_rate
-        u = (ff if ff.ndim == 2 else ff[:, min(k, ff.shape[1] - 1)]) + excitation[:, k % period]
-        u = u + controller.kp * (ref - y) + controller.ki * integral - controller.kd * velocity
+        u = _at(controller.feed_forward, k) + excitation[:, k % period]
+        u = u + _at(controller.kp, k) * (ref - y) + _at(controller.ki, k) * integral - _at(controller.kd, k) * velocity
         tau[:, k] = u + noise.tau * rng.standard_normal((S, n))
         q[:, k], q_link[:, k] = y, y_link
         u = u + noise.process * rng.standard_normal((S, n))
@@ -124,6 +124,11 @@ def run_loop(
     if progress is not None:
         progress(1.0)
     return Record(tau, q, q_link)
+
+
+def _at(x: np.ndarray, k: int) -> np.ndarray:
+    """Sample k of (S, N, n), the last one beyond its end; (S, n) as it is."""
+    return x if x.ndim == 2 else x[:, min(k, x.shape[1] - 1)]
 
 
 def _fine_step(
