@@ -7,7 +7,7 @@ then the next point. What is spent on the way is counted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,7 +59,7 @@ def schedule_plan(plan: Plan, *, settle: float = SETTLE) -> Schedule:
     Raises:
         DataError: for a plan without anything in it, or a negative time.
     """
-    items = (*plan.experiments, *plan.trajectories)
+    items: tuple[Experiment | Trajectory, ...] = (*plan.experiments, *plan.trajectories)
     if not items:
         raise DataError("plan", plan.robot.name, "neither experiment nor motion", "at least one")
     if not 0 <= settle < 1e4:
@@ -70,7 +70,9 @@ def schedule_plan(plan: Plan, *, settle: float = SETTLE) -> Schedule:
     q_ref, r = [], []
     clock, at = 0, None
 
-    def add(kind: str, q: np.ndarray, excitation: np.ndarray | None = None, source=None) -> None:
+    def add(
+        kind: str, q: np.ndarray, excitation: np.ndarray | None = None, source: Experiment | Trajectory | None = None
+    ) -> None:
         nonlocal clock
         parts.append(Part(kind, clock, clock + len(q), source))
         q_ref.append(q)
@@ -122,23 +124,11 @@ def cut_recording(recording: Dataset, schedule: Schedule) -> Dataset:
         raise DataError("sample_rate", name, f"{recording.sample_rate:g} Hz", f"{x.sample_rate:g} Hz as planned")
     if whole.n_samples != len(schedule.q_ref):
         raise DataError("samples", name, str(whole.n_samples), f"{len(schedule.q_ref)}, the length of the plan")
-    cut = [_segment(whole, schedule, part) for part in schedule.parts if part.source is not None]
-    return Dataset(
-        name=recording.name,
-        robot_ref=recording.robot_ref,
-        robot=recording.robot,
-        sample_rate=recording.sample_rate,
-        joints=recording.joints,
-        input_hold=recording.input_hold,
-        q_std=recording.q_std,
-        tau_std=recording.tau_std,
-        controller=recording.controller,
-        segments=tuple(cut),
-    )
+    cut = [_segment(whole, schedule, part, part.source) for part in schedule.parts if part.source is not None]
+    return replace(recording, segments=tuple(cut))
 
 
-def _segment(whole: Segment, schedule: Schedule, part: Part) -> Segment:
-    source = part.source
+def _segment(whole: Segment, schedule: Schedule, part: Part, source: Experiment | Trajectory) -> Segment:
     off = np.abs(np.mean(whole.q[part.samples] - schedule.q_ref[part.samples], axis=0))
     worst = int(np.argmax(off))
     if not off[worst] < OFF_POSTURE:

@@ -71,6 +71,7 @@ def fit_frf(
     starts: Sequence[Parameters] | None = None,
     seed: int = 0,
     fitted: Collection[str] | None = None,
+    search: bool = True,
 ) -> Estimate:
     """Fit log-parameters to the FRFs of all operating points.
 
@@ -81,6 +82,7 @@ def fit_frf(
         sample_time: s. hold: of the recorded torque, "zoh" or "none".
         seed: of the drawn starts.
         fitted: names of ``parameter_names`` or "timing"; the others are held at the starts. All where None.
+        search: whether that search is made; else the wanted criterion is minimised from the best start by it.
 
     Raises:
         DataError: for an estimator or parameter that there is not, an arm of another number of motors, or
@@ -97,10 +99,11 @@ def fit_frf(
     if stray:
         raise DataError("fitted", "fit_frf", stray[0], f"of {names}")
     free = np.array([fitted is None or name in fitted for name in names])
-    search = _Criterion.of(structure, frf, sample_time, hold, "lls", SEARCH_SNR)
-    found = [_minimise(search, p, free, SEARCH) for p in (tuple(starts) if starts else _starts(nominal, seed))]
+    ends = list(starts or _starts(nominal, seed))
+    if search:
+        first = _Criterion.of(structure, frf, sample_time, hold, "lls", SEARCH_SNR)
+        ends = [_minimise(first, p, free, SEARCH).parameters for p in ends]
     criterion = _Criterion.of(structure, frf, sample_time, hold, estimator)
-    ends = [f.parameters for f in found]
     # LLS hardly sees weak springs: an end that it likes may be far off by the wanted criterion.
     best = min(ends, key=lambda p: criterion.normal(p, criterion.linearised(p), free)[0]) if len(ends) > 1 else ends[0]
     for _ in range(ROUNDS):
