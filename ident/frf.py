@@ -255,9 +255,11 @@ def _covariance(
         if noise is not None:
             # Distortion is smooth over frequency: its part is steadied before it is held at zero or more.
             k = np.arange(n)
-            floor = noise[:, k, k].real
-            excess = shape * mean_over_lines((total[:, k, k].real - floor) / shape, 2 * SMOOTH)
-            total[:, k, k] = floor + np.maximum(excess, 0.0)
+            floor, found = noise[:, k, k].real, total[:, k, k].real
+            excess = shape * mean_over_lines((found - floor) / shape, 2 * SMOOTH)
+            # Correlations are kept: a variance lowered alone would leave no covariance matrix.
+            root = np.sqrt((floor + np.maximum(excess, 0.0)) / found)
+            total = root[:, :, None] * total * root[:, None, :]
     if total is None:
         total = np.zeros((F, n, n), complex)
     noise = total if noise is None else noise

@@ -80,6 +80,20 @@ def test_distortion_shows_in_the_total_but_not_in_the_noise():
     assert np.median(total / noise) > 20
 
 
+@pytest.mark.parametrize(("M", "P"), [(2, 2), (3, 2), (2, 1), (4, 3)])
+def test_every_covariance_can_weight_a_fit(M, P):
+    """Positive definite, with distortion that varies from line to line and is common to the outputs."""
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        _, blocks = closed_loop(rng, 1e-3, M=M, P=P)
+        common = rng.normal(size=(M, 1, 60, 1, 2)) * np.exp(2 * rng.normal(size=(1, 1, 60, 1, 1)))
+        Y = blocks.Y + 0.05 * common * np.array([[1.0], [0.98]])
+        blocks = Blocks(blocks.U, Y, blocks.R)
+        for C in _covariance(blocks, average(blocks, "jio"), "jio"):
+            d = np.sqrt(np.einsum("fii->fi", C).real)
+            assert np.linalg.eigvalsh(C / (d[:, :, None] * d[:, None, :])).min() > 0
+
+
 def test_realizations_lower_the_error_by_their_root():
     rng = np.random.default_rng(3)
     def rms(M):
