@@ -23,10 +23,14 @@ test: $(STAMP)
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -n 2
 
+# A quick size; `make bench SIZE=--full` for the figures of the README.
 bench: $(STAMP)
 	$(BIN)/python benchmarks/bench_plant.py
 	$(BIN)/python benchmarks/bench_clean.py
-	$(BIN)/python benchmarks/bench_estimators.py
+	$(BIN)/python benchmarks/bench_estimators.py $(SIZE)
+	$(BIN)/python benchmarks/bench_frf.py $(SIZE)
+	$(BIN)/python benchmarks/bench_criteria.py $(SIZE)
+	$(BIN)/python benchmarks/bench_paper.py $(SIZE)
 	$(BIN)/python benchmarks/bench_design.py
 	$(BIN)/python benchmarks/bench_local.py
 	$(BIN)/python benchmarks/bench_diagnose.py

@@ -111,7 +111,7 @@ def model_error_table(shares: tuple[float, ...], seeds: range) -> None:
 
 
 def main(full: bool = False) -> None:
-    convergence_table(40 if full else 8)
+    convergence_table(24 if full else 8)
     model_error_table(SHARES if full else (0.0, 0.1), range(1, 6 if full else 2))
 
 

@@ -4,7 +4,7 @@ H1, JIO, ARI, HAR and LOG: bias on a synthetic closed loop over noise. NLS, WNLS
 error over the Cramer-Rao bound and coverage of intervals on FRFs of the irb, the time of a fit, and how it
 grows. The same and the torque-residual fit: errors on one effect-free UR10 data set.
 
-    python benchmarks/bench_estimators.py [DRAWS]
+    python benchmarks/bench_estimators.py [--full | DRAWS]
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ def closed_loop(rng: np.random.Generator, noise: float, M: int = 20, F: int = 40
     return G, Blocks(U[:, None], (G @ U + v)[:, None], R)
 
 
-def bias_table(draws: int = 100) -> None:
+QUICK, FULL = 10, 100  # draws
+
+
+def bias_table(draws: int = FULL) -> None:
     """Print relative bias and rms error of the five averages over noise."""
     rng = np.random.default_rng(0)
     print("noise/r   " + "  ".join(f"{a.upper():>13s}" for a in AVERAGES) + "   relative bias / rms error, 20 realizations")
@@ -133,7 +136,7 @@ def fitted_case(case: dict, frf: FRF, estimator: str, start: Parameters):
     return fit, (fit.parameters.to_log() - case["truth"].to_log())[case["chosen"]], seconds
 
 
-def efficiency_table(draws: int = 100) -> None:
+def efficiency_table(draws: int = FULL) -> None:
     """Print mean square errors over the Cramer-Rao bound, coverage of 95 % intervals, and seconds a fit."""
     case, rng = frf_case(15, 80), np.random.default_rng(1)
     spring = np.array([name.startswith("stiffness") for name in case["fitted"]])
@@ -159,19 +162,22 @@ def efficiency_table(draws: int = 100) -> None:
 
 
 def scaling_table() -> None:
-    """Print the time of a WLLS fit from one start over points and lines."""
+    """Print the time of a WLLS fit from one start over points and lines, and the power with which it grows."""
+    grid = [(points, lines) for points in (5, 15, 45) for lines in (20, 80, 320)]
+    seconds = []
+    for points, lines in grid:
+        case = frf_case(points, lines)
+        seconds.append(fitted_case(case, draw(case, np.random.default_rng(2)), "wlls", case["nominal"])[2])
     print("CPU seconds of a WLLS fit from one start, irb\npoints  lines: 20     80    320")
-    for points in (5, 15, 45):
-        cells = []
-        for lines in (20, 80, 320):
-            case = frf_case(points, lines)
-            cells.append(fitted_case(case, draw(case, np.random.default_rng(2)), "wlls", case["nominal"])[2])
-        print(f"{points:6d}       " + " ".join(f"{c:6.2f}" for c in cells))
-    print()
+    for k in range(0, len(grid), 3):
+        print(f"{grid[k][0]:6d}       " + " ".join(f"{c:6.2f}" for c in seconds[k : k + 3]))
+    rows = np.column_stack([np.ones(len(grid)), np.log(grid)])
+    power = np.linalg.lstsq(rows, np.log(seconds), rcond=None)[0]
+    print(f"time ~ points^{power[1]:.2f} lines^{power[2]:.2f}\n")
 
 
-def main(draws: int = 100) -> None:
-    bias_table()
+def main(draws: int = QUICK) -> None:
+    bias_table(draws)
     efficiency_table(draws)
     scaling_table()
     robot = load_robot("ur10")
@@ -200,4 +206,4 @@ def main(draws: int = 100) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:2]))
+    main(FULL if "--full" in sys.argv[1:] else int(sys.argv[1]) if len(sys.argv) > 1 else QUICK)
