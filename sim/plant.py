@@ -61,24 +61,8 @@ def build_plant(
         drives: true values of ``DRIVE_FIELDS``, each (n,); nominal where absent.
         timestep: s. integrator: of ``mujoco.mjtIntegrator``.
     """
-    figures = {f: robot.array(f) for f in DRIVE_FIELDS} | dict(drives or {})
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    spec.option.timestep = timestep
-    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
-    spec.option.gravity = list(robot.gravity)
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    hinges = list(robot.elasticities)
-    for effect in effects:
-        hinges += getattr(effect, "hinges", lambda: ())()
-    _add_chain(spec, robot, hinges)
-    for j, joint in enumerate(robot.joints):
-        _add_drive(spec, joint.name, {f: figures[f][j] for f in DRIVE_FIELDS})
-    for effect in effects:
-        edit = getattr(effect, "edit", None)
-        if edit is not None:
-            edit(spec, robot, figures)
-    model = spec.compile()
+    figures, hinges = _figures(robot, drives), _hinges(robot, effects)
+    model = build_spec(robot, effects, drives=drives, timestep=timestep, integrator=integrator).compile()
 
     def address(name: str) -> int:
         return int(model.joint(name).qposadr[0])
@@ -92,6 +76,43 @@ def build_plant(
         robot=robot,
         effects=tuple(effects),
     )
+
+
+def build_spec(
+    robot: Robot,
+    effects: Sequence = (),
+    *,
+    drives: dict[str, np.ndarray] | None = None,
+    timestep: float = 2.5e-4,
+    integrator: str = "RK4",
+) -> mujoco.MjSpec:
+    """What ``build_plant`` compiles, for those who add to it; arguments as there."""
+    figures = _figures(robot, drives)
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = timestep
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    spec.option.gravity = list(robot.gravity)
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    _add_chain(spec, robot, _hinges(robot, effects))
+    for j, joint in enumerate(robot.joints):
+        _add_drive(spec, joint.name, {f: figures[f][j] for f in DRIVE_FIELDS})
+    for effect in effects:
+        edit = getattr(effect, "edit", None)
+        if edit is not None:
+            edit(spec, robot, figures)
+    return spec
+
+
+def _figures(robot: Robot, drives: dict[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+    return {f: robot.array(f) for f in DRIVE_FIELDS} | dict(drives or {})
+
+
+def _hinges(robot: Robot, effects: Sequence) -> list[Elasticity]:
+    hinges = list(robot.elasticities)
+    for effect in effects:
+        hinges += getattr(effect, "hinges", lambda: ())()
+    return hinges
 
 
 def link_inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:

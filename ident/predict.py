@@ -1,0 +1,393 @@
+"""Prediction-error identification: the Kalman predictor of the linearised arm, and the fit that all predictors share.
+
+At each operating point the gray-box is sampled exactly (the torque is held over a sample) and the predictor is
+the stationary Kalman filter of criterion (3), equations (5) and (6), of Wernholt and Moberg (2011):
+
+    x(t+1) = A x(t) + B u(t) + K e(t),    e(t) = y(t) - C x(t),    y = motor positions
+    P = A P A^T + B Q B^T - K Lambda K^T,    Lambda = C P C^T + R,    K = A P C^T Lambda^-1
+
+with states ``[q_m, q_a, q_m', q_a']`` about the equilibrium. ``Q``: white noise on the motor torque, held over a
+sample; ``R``: white noise of the position. The criterion is the Gaussian likelihood of the innovations, whose
+weight is their covariance, so that the standard deviations of both noises are found with the parameters. Noise of
+the *record* of the torque counts as noise of the torque; it correlates with the input, which biases gains by the
+share of its power in that of the torque. ``Parameters.timing`` is not modelled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numba import njit
+
+from ident.dataset import Dataset
+from ident.frf import choose_segments
+from ident.graybox import (
+    Linearisation,
+    Parameters,
+    Structure,
+    damping_diagonal,
+    equilibrium,
+    linearise,
+    parameter_names,
+    stiffness_diagonal,
+)
+from robot_assets.errors import DataError
+
+PROMISE = 1e-3  # fall of -2 log L that a step promises at which a fit is done: far below one standard deviation
+LONGEST = 0.7  # step in a log-parameter
+DIFFERENCE = 1e-5  # step of the differences that give derivatives of innovations
+WIDE, WIDEST = 20.0, 0.05  # and of a likelihood that jumps: in standard deviations of a coordinate by itself, and at most
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Recordings from rest, cut alike.
+
+    Attributes:
+        u: (R, T, n) recorded motor torque, N m. y: (R, T, n) motor position, rad.
+        point: (R,) index of the operating point of each. q0: (Q, n) rad, motors at rest there.
+        skip: leading samples that the criterion leaves out: the predictor settles.
+        sample_time: s.
+    """
+
+    u: np.ndarray
+    y: np.ndarray
+    point: np.ndarray
+    q0: np.ndarray
+    skip: int
+    sample_time: float
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations (n,): torque held over a sample, N m; position, rad."""
+
+    process: np.ndarray
+    measurement: np.ndarray
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """The sampled linear arm, deviations from rest; states ``[q_m (n), q_a (N)]`` and their velocities.
+
+    Attributes:
+        A: (nx, nx). B: (nx, n) for a torque held over the sample. The output is the first n states.
+        continuous, gain: A and B before sampling, 1/s.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    continuous: np.ndarray
+    gain: np.ndarray
+
+
+@dataclass(frozen=True)
+class Kalman:
+    """Stationary predictor: K (nx, n), covariance P (nx, nx) of the predicted state, Lambda (n, n) of innovations."""
+
+    space: StateSpace
+    K: np.ndarray
+    P: np.ndarray
+    Lambda: np.ndarray
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a predictor says of runs, transient left out.
+
+    Attributes:
+        innovations: (R, T, n) rad. covariance: (R, 1 or T, n, n) of them.
+        log_likelihood: of the runs; that of Gaussian innovations where the predictor has no better.
+    """
+
+    innovations: np.ndarray
+    covariance: np.ndarray
+    log_likelihood: float
+
+
+Predictor = Callable[[Parameters, Noise], Prediction]
+
+
+@dataclass(frozen=True)
+class PredictionFit:
+    """Result of ``fit_prediction``.
+
+    Attributes:
+        parameters, noise: at the maximum.
+        names: of the fitted log-coordinates: parameters, then ``process.<joint>`` and ``measurement.<joint>``.
+        covariance: (p, p) inverse Fisher information of those.
+        log_likelihood: there. evaluations: runs of the predictor. converged: whether it stopped by itself.
+    """
+
+    parameters: Parameters
+    noise: Noise
+    names: tuple[str, ...]
+    covariance: np.ndarray
+    log_likelihood: float
+    evaluations: int
+    converged: bool
+
+
+def runs_of(dataset: Dataset, *, role: str = "identification", amplitude: float | None = None) -> Runs:
+    """The multisine segments of a role at one level, whole; the highest level where None.
+
+    Raises:
+        DataError: where there are none, their lengths differ, they do not tell where the arm stood, or the torque
+            is not held.
+    """
+    if dataset.input_hold != "zoh":
+        raise DataError("input_hold", dataset.name, dataset.input_hold, '"zoh", which the sampled model takes')
+    points, _ = choose_segments(dataset, role, amplitude)
+    chosen = [s for members in points.values() for s in members]
+    first = chosen[0]
+    for s in chosen:
+        if s.tau.shape != first.tau.shape or s.transient_periods * s.period != first.transient_periods * first.period:
+            raise DataError("samples", s.name, f"{s.n_samples}", f"{first.n_samples}, as in {first.name}")
+        if s.q0 is None:
+            raise DataError("q0", s.name, "none", "the posture at rest")
+    return Runs(
+        np.stack([s.tau for s in chosen]),
+        np.stack([s.q for s in chosen]),
+        np.repeat(np.arange(len(points)), [len(m) for m in points.values()]),
+        np.stack([m[0].q0 for m in points.values()]),
+        first.transient_periods * first.period,
+        1.0 / dataset.sample_rate,
+    )
+
+
+def spring_torque(structure: Structure, par: Parameters) -> np.ndarray:
+    """(n + N, nx) torque of springs and dampers on motors and links per state; motor friction among it."""
+    n, N, driven = structure.n, structure.n_coordinates, structure.driven
+    out = []
+    for gear, diagonal in ((par.stiffness, stiffness_diagonal), (par.damping, damping_diagonal)):
+        W = np.zeros((n + N, n + N))
+        W[:n, :n] = -par.coupling.T @ (gear[:, None] * par.coupling)
+        W[:n, n + driven] = par.coupling.T * gear
+        W[n + driven, :n] = gear[:, None] * par.coupling
+        W[n:, n:] = -np.diag(diagonal(structure, par))
+        out.append(W)
+    k = np.arange(n)
+    out[1][k, k] -= par.viscous
+    return np.concatenate(out, axis=1)
+
+
+def state_space(structure: Structure, par: Parameters, lin: Linearisation, sample_time: float) -> StateSpace:
+    """Exact zero-order-hold sampling of the arm linearised at ``lin``."""
+    n, N = structure.n, structure.n_coordinates
+    half = n + N
+    W = spring_torque(structure, par)
+    W[n:, n:half] -= lin.Kg
+    continuous, gain = np.zeros((2 * half, 2 * half)), np.zeros((2 * half, n))
+    continuous[:half, half:] = np.eye(half)
+    continuous[half : half + n] = W[:n] / par.inertia[:, None]
+    continuous[half + n :] = np.linalg.solve(lin.M, W[n:])
+    gain[half : half + n] = np.diag(1.0 / par.inertia)
+    (A, B), _ = held(continuous, gain, sample_time)
+    return StateSpace(A, B, continuous, gain)
+
+
+def held(continuous: np.ndarray, gain: np.ndarray, sample_time: float) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """((A, B) for an input held over a sample, B for one that rises linearly over it from zero to one)."""
+    nx, m = gain.shape
+    block = np.zeros((nx + 2 * m, nx + 2 * m))
+    block[:nx, :nx], block[:nx, nx : nx + m] = continuous * sample_time, gain * sample_time
+    block[nx : nx + m, nx + m :] = np.eye(m)
+    E = scipy.linalg.expm(block)
+    return (E[:nx, :nx], E[:nx, nx : nx + m]), E[:nx, nx + m :]
+
+
+def kalman(space: StateSpace, noise: Noise, sample_time: float) -> Kalman:
+    """Stationary predictor from the discrete Riccati equation.
+
+    States are scaled to the size of the noise first: radians and their variances leave the equation no digits.
+
+    Raises:
+        DataError: where no stationary predictor is found.
+    """
+    nx, n = space.B.shape
+    size = float(np.exp(np.mean(np.log(noise.measurement))))
+    scale = size * np.repeat([1.0, 0.1 / sample_time], nx // 2)
+    A = space.A * scale / scale[:, None]
+    G = space.B * noise.process / scale[:, None]
+    try:
+        P = scipy.linalg.solve_discrete_are(A.T, np.eye(nx)[:, :n], G @ G.T, np.diag((noise.measurement / size) ** 2))
+    except np.linalg.LinAlgError as error:
+        raise DataError("Riccati equation", "kalman", str(error), "a detectable arm with noise on every motor") from error
+    P = P * scale[:, None] * scale
+    P = 0.5 * (P + P.T)
+    Lambda = P[:n, :n] + np.diag(noise.measurement**2)
+    return Kalman(space, space.A @ np.linalg.solve(Lambda, P[:n]).T, P, Lambda)
+
+
+def local_predictor(structure: Structure, runs: Runs) -> Predictor:
+    """Predictor of criterion (3): stationary Kalman filters of the arm linearised where each run was measured.
+
+    Torques and positions are taken from their means over the samples that count, as FRFs are.
+    """
+    u, y = (x - x[:, runs.skip :].mean(axis=1, keepdims=True) for x in (runs.u, runs.y))
+
+    def predict(par: Parameters, noise: Noise) -> Prediction:
+        filters = []
+        for q in runs.q0:
+            lin = linearise(structure, equilibrium(structure, par, q))
+            filters.append(kalman(state_space(structure, par, lin, runs.sample_time), noise, runs.sample_time))
+        e = np.stack([innovations(filters[p], u[r], y[r]) for r, p in enumerate(runs.point)])
+        return gaussian(e[:, runs.skip :], np.stack([filters[p].Lambda for p in runs.point])[:, None])
+
+    return predict
+
+
+def innovations(predictor: Kalman, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(T, n) one-step prediction errors of one run (T, n) from the state zero."""
+    space = predictor.space
+    return _innovations(space.A, space.B, predictor.K, np.ascontiguousarray(u), np.ascontiguousarray(y))
+
+
+@njit(cache=True, nogil=True)
+def _innovations(A, B, K, u, y):
+    T, n = u.shape
+    nx = A.shape[0]
+    e, x, new = np.empty((T, n)), np.zeros(nx), np.empty(nx)
+    for t in range(T):
+        for i in range(n):
+            e[t, i] = y[t, i] - x[i]
+        for i in range(nx):
+            total = 0.0
+            for j in range(nx):
+                total += A[i, j] * x[j]
+            for j in range(n):
+                total += B[i, j] * u[t, j] + K[i, j] * e[t, j]
+            new[i] = total
+        x[:] = new
+    return e
+
+
+def gaussian(e: np.ndarray, S: np.ndarray) -> Prediction:
+    """Prediction with the likelihood of Gaussian innovations (R, T, n) of covariance (R, 1 or T, n, n)."""
+    w = (np.linalg.inv(np.linalg.cholesky(S)) @ e[..., None])[..., 0]
+    logdet = np.linalg.slogdet(S)[1].sum() * (e.shape[1] / S.shape[1])
+    return Prediction(e, S, -0.5 * float(np.sum(w**2) + logdet + e.size * np.log(2 * np.pi)))
+
+
+def fit_prediction(
+    predict: Predictor,
+    structure: Structure,
+    start: Parameters,
+    noise: Noise,
+    *,
+    fitted: Collection[str] | None = None,
+    guide: Predictor | None = None,
+    steps: int = 40,
+    promise: float = PROMISE,
+) -> PredictionFit:
+    """Maximise the likelihood of a predictor over log-parameters and log standard deviations of its noise.
+
+    Scoring (Gupta and Mehra 1974) with Levenberg's damping: Fisher information and gradient from differences of
+    innovations and of their covariance.
+
+    Args:
+        start, noise: where the search begins.
+        fitted: names of ``parameter_names``; the others are held. All where None.
+        guide: for a predictor whose likelihood jumps, one that is smooth and nearly the same: information is taken
+            from it, and the gradient from differences of the likelihood over ``WIDE`` of its standard deviations.
+        steps: at most. promise: fall of ``-2 log L`` that a step must promise, ``PROMISE`` unless chance is larger.
+
+    Raises:
+        DataError: for a parameter that there is not, or a predictor that fails at the start.
+    """
+    names = parameter_names(structure.robot)
+    stray = sorted(set(fitted or ()) - set(names))
+    if stray:
+        raise DataError("fitted", "fit_prediction", stray[0], f"of {names}")
+    free = np.array([fitted is None or name in fitted for name in names])
+    p, n, whole = int(free.sum()), structure.n, start.to_log()
+    x = np.concatenate([whole[free], np.log(noise.process), np.log(noise.measurement)])
+    count = 0
+
+    def at(x: np.ndarray) -> tuple[Parameters, Noise]:
+        moved = whole.copy()
+        moved[free] = x[:p]
+        return start.with_log(moved), Noise(*np.exp(x[p:]).reshape(2, n))
+
+    def look(x: np.ndarray, predict: Predictor = predict) -> Prediction | None:
+        nonlocal count
+        count += 1
+        try:
+            found = predict(*at(x))
+        except (DataError, np.linalg.LinAlgError):
+            return None
+        return found if np.isfinite(found.log_likelihood) and np.all(np.isfinite(found.innovations)) else None
+
+    def slopes(now: Prediction, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if guide is None:
+            return score(look, now, x)
+        near = look(x, guide)
+        if near is None:
+            raise DataError("guide", "fit_prediction", "a predictor that fails", "one that runs where the other does")
+        _, F = score(lambda x: look(x, guide), near, x)
+        moves = np.diag(np.minimum(WIDE / np.sqrt(np.maximum(np.diag(F), 1e-300)), WIDEST))
+        ends = [(look(x + move), look(x - move)) for move in moves]
+        if any(end is None for pair in ends for end in pair):
+            raise DataError("predictor", "fit_prediction", "a failure beside the estimate", "parameters that it can run with")
+        return np.array([a.log_likelihood - b.log_likelihood for a, b in ends]) / (2 * np.diag(moves)), F
+
+    now = look(x)
+    if now is None:
+        raise DataError("start", "fit_prediction", "a predictor that fails there", "parameters that it can run with")
+    damping, converged = 1e-3, False
+    g, F = slopes(now, x)
+    for _ in range(steps):
+        size = np.sqrt(np.maximum(np.diag(F), 1e-300))
+        step = np.linalg.lstsq(F / np.outer(size, size) + damping * np.eye(len(x)), g / size, rcond=1e-14)[0] / size
+        step = step / max(1.0, np.max(np.abs(step)) / LONGEST)
+        promised = 2 * g @ step - step @ F @ step
+        if promised < promise and damping < 1e-1:
+            converged = True
+            break
+        trial = look(x + step)
+        gain = -1.0 if trial is None else 2 * (trial.log_likelihood - now.log_likelihood) / promised
+        if gain > 0:
+            x, now = x + step, trial
+            g, F = slopes(now, x)
+            damping = max(damping * (0.2 if gain > 0.5 else 1.0), 1e-9)
+        elif damping > 1e8:
+            break
+        else:
+            damping *= 6.0
+    labels = [name for name, use in zip(names, free, strict=True) if use]
+    labels += [f"{kind}.{joint}" for kind in ("process", "measurement") for joint in structure.robot.joint_names]
+    return PredictionFit(*at(x), tuple(labels), np.linalg.pinv(F, hermitian=True), now.log_likelihood, count, converged)
+
+
+def score(
+    look: Callable[[np.ndarray], Prediction | None], now: Prediction, x: np.ndarray, difference: float = DIFFERENCE
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient of the Gaussian log-likelihood (p,) and Fisher information (p, p) at ``x``.
+
+    Where the covariance of innovations changes along a run, its part of the information is taken from means.
+
+    Raises:
+        DataError: where the predictor fails beside ``x``.
+    """
+    e, S = now.innovations, now.covariance
+    T, repeats = e.shape[1], e.shape[1] / S.shape[1]
+    root = np.linalg.inv(np.linalg.cholesky(S))
+    w = (root @ e[..., None])[..., 0]
+    g, slopes, spreads = np.empty(len(x)), [], []
+    for i in range(len(x)):
+        moved = x.copy()
+        moved[i] += difference
+        beside = look(moved)
+        if beside is None:
+            raise DataError("predictor", "score", "a failure beside the estimate", "parameters that it can run with")
+        dw = (root @ ((beside.innovations - e) / difference)[..., None])[..., 0]
+        dS = root @ ((beside.covariance - S) / difference) @ np.swapaxes(root, -1, -2)
+        bent = ((dS @ w[..., None])[..., 0] * w).sum()
+        g[i] = -np.sum(w * dw) + 0.5 * bent - 0.5 * repeats * np.einsum("rtii->", dS)
+        slopes.append(dw.ravel())
+        spreads.append(np.sqrt(0.5 * T) * dS.mean(axis=1).ravel())
+    J, D = np.stack(slopes), np.stack(spreads)
+    return g, J @ J.T + D @ D.T
