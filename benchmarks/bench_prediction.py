@@ -40,7 +40,8 @@ from ident.excitation import operating_points
 from ident.filters import extended_kalman, particle_filter
 from ident.frf import estimate_frf
 from ident.graybox import Parameters, Structure, build_structure, parameter_names
-from ident.predict import Noise, PredictionFit, Runs, fit_prediction, local_predictor, runs_of
+from ident.kalman import local_predictor
+from ident.predict import Noise, PredictionFit, Runs, fit_prediction, runs_of
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, load_robot
 from sim import run_experiment

@@ -9,7 +9,7 @@ Salmond and Smith 1993). Both step the same arm, split into what is linear about
 
 with ``W x`` the torque of the springs on the links. Exponential time differencing (ETD2RK of Cox and Matthews, J.
 Comput. Phys. 176 (2002)) steps it: the stiff linear part is exact at any step, so that a linear arm is predicted as by
-``ident.predict.kalman``, and the remainder is of second order. ``M``, ``c`` and ``g`` are those of ``ident.recursion``.
+``ident.kalman``, and the remainder is of second order. ``M``, ``c`` and ``g`` are those of ``ident.recursion``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import numpy as np
 from numba import njit
 
 from ident.graybox import Parameters, Structure, equilibrium, linearise
-from ident.predict import Kalman, Noise, Prediction, Predictor, Runs, gaussian, held, kalman, spring_torque, state_space
+from ident.kalman import Kalman, held, kalman, spring_torque, state_space
+from ident.predict import Noise, Prediction, Predictor, Runs, gaussian
 from ident.recursion import _recursion, chain_of
 
 NUDGE = 1e-6  # rad and rad/s, differences of inverse dynamics
@@ -61,7 +62,9 @@ def stepper(structure: Structure, par: Parameters, noise: Noise, q0: np.ndarray,
     entry[2 * n + N :] = np.eye(N)
     (_, hold), rise = held(space.continuous, entry, sample_time)
     return Stepper(
-        *map(np.ascontiguousarray, (x0, -W[:n] @ x0, space.A, space.B, hold, rise, W[n:], space.continuous[2 * n + N :])),
+        x0,
+        -W[:n] @ x0,
+        *map(np.ascontiguousarray, (space.A, space.B, hold, rise, W[n:], space.continuous[2 * n + N :])),
         kalman(space, noise, sample_time),
     )
 
@@ -237,7 +240,9 @@ def _extended(chain, x0, u0, A, B, hold, rise, springs, flat, Q, R, P, u, y, e, 
 
 
 @njit(cache=True, nogil=True)
-def _bootstrap(chain, x0, u0, A, B, hold, rise, springs, flat, process, measurement, X, draws, uniform, u, y, e, S, gain):
+def _bootstrap(
+    chain, x0, u0, A, B, hold, rise, springs, flat, process, measurement, X, draws, uniform, u, y, e, S, gain
+):
     T, n = y.shape
     P = X.shape[0]
     log_weight = np.full(P, -np.log(P))
