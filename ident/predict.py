@@ -4,7 +4,9 @@ The predictors are in ``ident.kalman`` (local, criterion (3) of Wernholt and Mob
 (nonlinear, criterion (2)). Both give innovations ``e`` with covariance ``S``; what is maximised is the likelihood
 ``-1/2 sum e^T S^-1 e + log det 2 pi S``, so that the standard deviations of the noise are found with the parameters.
 Noise of the *record* of the torque counts as noise of the torque; it correlates with the input, which biases gains by
-the share of its power in that of the torque. ``Parameters.timing`` is not modelled.
+the share of its power in that of the torque. A controller may be at work, provided it knows no more of the arm than the
+recorded positions: one that also reads a tachometer puts more into ``u`` than predictions allow for, a bias again.
+``Parameters.timing`` is not modelled.
 """
 
 from __future__ import annotations
