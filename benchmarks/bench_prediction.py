@@ -12,8 +12,9 @@ the true ones by up to two, and fit stiffness, damping, motor inertia and fricti
 - mujoco.sysid: rollouts of the recorded torque, steadied by a servo to the recorded motion, as an arm that gravity or
   drift would carry off needs. Its own optimiser, with log-parameters.
 
-"late": from the first WLLS estimate instead, for prediction errors have local minima. Seconds are of processor, compilation left out, and the median over the starts. A start has converged where every
-spring ends within 5 % of the truth and every damper within 50 %; errors are over those starts.
+"late": from the first WLLS estimate instead, for prediction errors have local minima. Seconds are of processor,
+compilation left out, and the median over the starts. A start has converged where every spring ends within 5 % of the
+truth and every damper within 50 %; errors are over those starts.
 
     python benchmarks/bench_prediction.py [--full]
 """
