@@ -31,8 +31,7 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/bench_frf.py $(SIZE)
 	$(BIN)/python benchmarks/bench_criteria.py $(SIZE)
 	$(BIN)/python benchmarks/bench_paper.py $(SIZE)
-	$(BIN)/python benchmarks/bench_estimators.py
-	$(BIN)/python benchmarks/bench_prediction.py
+	$(BIN)/python benchmarks/bench_prediction.py $(SIZE)
 	$(BIN)/python benchmarks/bench_design.py
 	$(BIN)/python benchmarks/bench_local.py
 	$(BIN)/python benchmarks/bench_diagnose.py
