@@ -317,7 +317,8 @@ def attribute_once(
     ranked = sorted(best.values(), key=lambda x: x[1].cost)
     if ranked:
         before, ranked = under_noise_of_best(problem, before, ranked, workers)
-    spoilt = implausible(problem, before) or (ranked and ranked[0][0].options.get("bends"))
+    bent = bool(ranked) and ranked[0][0].options.get("bends", False)
+    spoilt = not problem.motions_alone and (bent or implausible(problem, before))
     allowed = DETECTION_EXCESS - 1.0 if spoilt else FAINT
     if min(before.chi2_per_dof - 1.0, left_by(ranked) / before.count) > allowed and not workers.late:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
@@ -509,13 +510,14 @@ def refit(
     None where its model cannot be computed, or ends where the data feel no change of its last effect.
     """
     try:
-        result = fit(
-            problem,
-            revived(problem, model),
-            iterations=iterations,
-            weights=weights,
-            remainders=remainders,
-        )
+        with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+            result = fit(
+                problem,
+                revived(problem, model),
+                iterations=iterations,
+                weights=weights,
+                remainders=remainders,
+            )
     except NOT_COMPUTED:
         return None
     felt = np.diag(result.information)[-len(result.model.effects[-1].p) :]
@@ -554,23 +556,20 @@ def beside_strong(
     def annealed(score: Score) -> Fit | None:
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
-            return anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
+            with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+                return anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
         except NOT_COMPUTED:
             return None
 
-    def tried(scores: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
-        fits = workers.map(annealed, scores, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
-        return [(s.hypothesis, r) for s, r in zip(scores, fits, strict=True) if r and not pointless(r.model.effects[-1])]
-
     likely = min(ranked, key=lambda x: x[1].cost)[0].joint if ranked else -1
     chosen = strong_effects(problem, before, scores, likely)
-    loops = [s for s in chosen if s.hypothesis.channel == "spring"]
-    strong = tried([replace(s, hypothesis=along_record(s.hypothesis)) for s in loops])
-    strong = [x for x in strong if not implausible(problem, x[1])]
-    strong = workers.map(lambda x: simulated(problem, *x), sorted(strong, key=lambda x: x[1].cost)[:FINALISTS])
-    strong += tried([s for s in chosen if s.hypothesis.channel != "spring"])
-    if left_by(strong) > SETTLED * max(before.cost - before.count, 1.0):
-        strong += tried(loops)
+    if not problem.motions_alone:
+        chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
+    fits = workers.map(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+    pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
+    strong = [(h, r) for h, r in pairs if not is_along_record(h)]
+    along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
+    strong += workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
     best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}

@@ -67,6 +67,7 @@ def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path):
     assert "elbow_joint" in verdict.residual_description
 
 
+@pytest.mark.slow
 def test_friction_of_every_joint_counts_once(ur10, tmp_path):
     """A real arm rubs everywhere: with one round the same effect is found at all joints that have it."""
     from sim import parse_effect
