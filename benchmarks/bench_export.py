@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from ident.conclude import baseline_values, reported_parameters
 from ident.dataset import Dataset
 from ident.diagnose import identify
 from ident.excitation import operating_points
-from ident.extended import Effect, Model
+from ident.extended import Effect, Model, along_record
 from ident.gain import measure_gain, segment_errors
 from ident.hypotheses import Hypothesis, catalogue
 from ident.show.export import NATIVE, build_mjcf, note_record
@@ -70,7 +71,10 @@ def both_gains(dataset: Dataset, effect, segments: int = 2) -> tuple[Gain, Gain]
     """Gain by prediction and by simulation on the same segments, over the joints in which the effect shows."""
     setup, baseline = identify(dataset)
     problem, robot = setup.problem, dataset.robot
-    result = fit(problem, Model(problem.structure, problem.nominal, (true_hypothesis(problem, effect),)))
+    hidden = true_hypothesis(problem, effect)
+    if hidden.hypothesis.options.get("bends"):
+        hidden = replace(hidden, hypothesis=along_record(hidden.hypothesis))
+    result = fit(problem, Model(problem.structure, problem.nominal, (hidden,)))
     groups = tuple(subset(g, spread(len(g.segments), segments)) for g in setup.held_out)
     predicted, _ = segment_errors(problem, groups, baseline.model, result.model)
     values = {k: v.value for k, v in baseline_values(result)[0].items()}

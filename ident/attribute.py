@@ -327,7 +327,7 @@ def attribute_once(
     rivals, excess = rivals_of_best(before, ranked)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
-    share = max(explained(before, weighed[0].fit), softly.get(id(weighed[0].hypothesis), 0.0))
+    share = max(explained(before, weighed[0].fit), softly.get(weighed[0].hypothesis.key, 0.0))
     return Round(before, tuple(weighed), tuple(scores), scale, share)
 
 
@@ -387,16 +387,16 @@ def explore_softly(
     direct: Sequence[tuple[Hypothesis, Fit]],
     hypotheses: Sequence[Hypothesis],
     workers: Workers,
-) -> tuple[Fit, list[tuple[Hypothesis, Fit]], list[Score], dict[int, float]]:
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]], list[Score], dict[tuple[str, str], float]]:
     """Candidates sought from a softened model, and those found ``direct``, under weights of the former.
 
     Returns:
-        The model without a new cause under these weights, candidates and scores; and by ``id`` of a hypothesis
+        The model without a new cause under these weights, candidates and scores; and by ``key`` of a hypothesis
         what it explains under softened weights: of two causes the sharp ones may see the other one alone.
     """
     stage, level = soften(problem, current)
     found, scores = explore(problem, stage, hypotheses, 0.0, workers, rough=True)
-    softly = {id(h): explained(stage, r) for h, r in found[:FINALISTS]}
+    softly = {h.key: explained(stage, r) for h, r in found[:FINALISTS]}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
@@ -442,7 +442,7 @@ def under_noise_of_best(
         (h, r if is_along_record(h) else new or reweighted(problem, r, weights))
         for (h, r), new in zip(ranked, again, strict=True)
     ]
-    return reweighted(problem, before, weights), weighed
+    return reweighted(problem, before, weights), sorted(weighed, key=lambda x: x[1].cost)
 
 
 def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
@@ -604,7 +604,9 @@ def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis,
     *others, last = result.model.effects
     model = replace(result.model, effects=(*others, replace(last, hypothesis=loop)))
     other = refit(problem, model, result.weights, result.remainders, FIRST_STEPS)
-    if other is not None and (other.chi2_per_dof < DETECTION_EXCESS or other.cost < AS_GOOD * result.cost):
+    # At the joint itself: another cause may be elsewhere.
+    noise, j = result.count / problem.structure.n, h.joint
+    if other is not None and other.costs[j] < max(DETECTION_EXCESS * noise, AS_GOOD * result.costs[j]):
         return loop, other
     return h, result
 
@@ -640,7 +642,7 @@ def weigh(candidates: Sequence[Candidate], excess: float) -> list[Candidate]:
     decoy = np.array([c.hypothesis.decoy for c in candidates], float)
     temper = TEMPER + MODEL_ERROR_SHARE / 6.0 * excess
     evidence = -0.5 * (cost - cost.min()) / temper - DECOY_NATS * decoy
-    evidence += [occam(c, temper) for c in candidates]
+    evidence += [occam(c, temper) + c.hypothesis.options.get("nats", 0.0) for c in candidates]
     evidence -= evidence.max()
     probability = np.exp(evidence) / np.exp(evidence).sum()
     out = [

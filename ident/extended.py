@@ -31,7 +31,6 @@ LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of 
 LOOP_MOST = 6  # the same, at most: modes far above the signals follow at once
 RECORD_STEPS = 20  # towards the deflection that agrees with a record
 NOISE_DRAWS = 4  # of the noise that a gear along its record answers to
-RECORD_LINES = 4  # lines on either side over which its covariance is averaged: it turns with the resonances
 LEAST_GAIN = 1e-3  # of a gear, torque at the motor per torque in parallel with its spring, that noise is divided by
 RECORD_BISECTIONS = 30  # of its mean
 LOOP_STEP = 0.25  # its step, at most, over the time scale of the fastest mode
@@ -97,24 +96,19 @@ class Prediction:
             Z = impedance(self.structure, replace(self.par, stiffness=stiffness), self.plane.lin, self.plane.s)[0]
         return self.plane.record[:, None, None] * Z
 
-
     def law_noise(self, group: Group) -> np.ndarray:
-        """(L, n, n) covariance that noise leaves in the torque through laws, beyond that of a linear arm, N2 m2.
+        """(L, n) power that position noise leaves in the torque through laws at the motors, N2 m2.
 
         A friction that turns within a small velocity carries the noise of a motor that stands still
-        with the slope of the turn; a gear along the recorded torque answers to its noise. By one draw of the noise
-        over all records.
+        with the slope of the turn. By one draw of the noise over all records.
         """
-        L, n = self.U.shape[1:]
-        out = np.zeros((L, n, n), complex)
+        out = np.zeros(self.U.shape[1:])
         at_motor = [e for e in self.model.effects if e.hypothesis.channel == "motor"]
-        along = {e.hypothesis.joint for e in self.model.effects if is_along_record(e.hypothesis) and group.window is None}
-        if not at_motor and not along:
+        if not at_motor:
             return out
         rng = np.random.default_rng(0)
         draw = rng.normal(size=(2, *self.U.shape)) * np.sqrt(0.5 * group.position_noise)
-        position = draw[0] + 1j * draw[1]
-        noisy = replace(self.solution, Q=self.solution.Q + position)
+        noisy = replace(self.solution, Q=self.solution.Q + draw[0] + 1j * draw[1])
         for effect in at_motor:
             j = effect.hypothesis.joint
             k = self.par.stiffness[j]
@@ -122,16 +116,18 @@ class Prediction:
                 effect.hypothesis.law(effect.p, Motion(group, x, self.par), j, k) for x in (noisy, self.solution)
             )
             change = self.plane.record * self.motion(group).lines(with_noise - without)
-            out[:, j, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
-        if along:
-            out += self._noise_along(group, sorted(along), rng)
+            out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
         return out
 
-    def _noise_along(self, group: Group, joints: Sequence[int], rng: np.random.Generator) -> np.ndarray:
-        """(L, n, n) covariance where gears of ``joints`` answer to the recorded torque, beyond that of the linear arm.
+    def record_noise(self, group: Group) -> np.ndarray | None:
+        """(L, n, n) covariance beyond that of the linear arm where gears answer to the recorded torque; None where none does.
 
-        By ``NOISE_DRAWS`` of the noise over all records.
+        Of all that noise leaves through laws, those at the motors too: by ``NOISE_DRAWS`` over all records.
         """
+        joints = sorted(joints_along_record(self.model, group))
+        if not joints:
+            return None
+        rng = np.random.default_rng(0)
         # Taken off before the mean over lines, and put back: the gain of a gear is sharp at its resonance.
         passed = np.ones(self.U.shape[1:])
         for j in joints:
@@ -148,7 +144,18 @@ class Prediction:
             linear = torque - np.einsum("lij,slj->sli", self.sampled_impedance, position)
             for x, sign in ((torque + self.U - there.U, 1.0), (linear, -1.0)):
                 more += sign * np.einsum("sli,slj->lij", x / passed, x.conj() / passed) / len(x) / NOISE_DRAWS
-        return passed[:, :, None] * mean_over_lines(more, RECORD_LINES) * passed[:, None, :]
+        return passed[:, :, None] * mean_over_lines(more, NOISE_LINES) * passed[:, None, :]
+
+
+def joints_along_record(model: Model, group: Group) -> set[int]:
+    """Joints whose gear is predicted along the record of a group.
+
+    Not in a motion, and not where the drive has an effect: its record is not the torque of the motor.
+    """
+    if group.window is not None:
+        return set()
+    drives = {e.hypothesis.joint for e in model.effects if e.hypothesis.channel == "drive"}
+    return {e.hypothesis.joint for e in model.effects if is_along_record(e.hypothesis)} - drives
 
 
 def predict(
@@ -193,7 +200,9 @@ def predict_at(
         Q[..., j] += effect.hypothesis.law(effect.p, Motion(group, bare, par), j, par.stiffness[j])
     inner = by_channel.get("link", []) + by_channel.get("spring", [])
     motor = by_channel.get("motor", [])
-    react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor) if inner else None
+    along = joints_along_record(model, group)
+    inner.sort(key=lambda e: e.hypothesis.joint in along and is_along_record(e.hypothesis))  # after what else is at the gear
+    react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor, along=along) if inner else None
     passes = 1 if len(inner) == 1 and _closes_itself(inner[0]) else REACTION_STEPS
     solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, react=react, passes=passes, steps=steps)
     U = solution.U
@@ -228,6 +237,7 @@ def _inner_torques(
     *,
     effects: Sequence[Effect],
     motors: Sequence[Effect],
+    along: set[int],
 ) -> Torques:
     """Spring and link torques of effects, solved together with the arm they act on.
 
@@ -235,7 +245,7 @@ def _inner_torques(
     that gear, the torques of all others held; or taken along the deflection that the recorded torque says.
 
     Args:
-        effects: in the gears and on the links; motors: at the motors.
+        effects: in the gears and on the links; motors: at the motors; along: joints that are predicted along the record.
     """
     S, L, n = solution.Q.shape
     motor = np.zeros((S, L, n), complex)
@@ -267,7 +277,7 @@ def _inner_torques(
         else:
             others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
-            if is_along_record(effect.hypothesis) and group.window is None:
+            if j in along and is_along_record(effect.hypothesis):
                 said, left = _along_record(law, par, plane, group, motion, j, c, others, motor + at_motors)
                 at_gear[j] = others + said
                 motor[..., j] += left
@@ -301,8 +311,9 @@ def along_record(h: Hypothesis) -> Hypothesis:
     A gear that rattles in its dead band has more than one steady state, and which of them a recording shows depends
     on how it began: the loop solved from rest ends in another, though the model is right. The recorded torque, less
     that of the motor, moved the link, and the link's open compliance says where that took the gear. What the law
-    leaves of that torque is passed on as the linear gear would, so that a linear law leaves what the loop does.
-    A motion, which is closed by a return that was not recorded, is predicted by the loop.
+    leaves of that torque reaches the gear's own motor as through the linear gear: there a linear law leaves what the
+    loop does. A motion, which is closed by a return that was not recorded, is predicted by the loop, and so is a joint
+    with an effect of its drive (``joints_along_record``).
     """
     return replace(h, options={**h.options, "along_record": True})
 
@@ -310,6 +321,11 @@ def along_record(h: Hypothesis) -> Hypothesis:
 def as_loop(h: Hypothesis) -> Hypothesis:
     """The law that ``along_record`` was made of."""
     return replace(h, options={k: v for k, v in h.options.items() if k != "along_record"})
+
+
+def simulated_laws(model: Model) -> Model:
+    """The model with all laws of the gear as loops."""
+    return replace(model, effects=tuple(replace(e, hypothesis=as_loop(e.hypothesis)) for e in model.effects))
 
 
 def _along_record(

@@ -16,7 +16,7 @@ import numpy as np
 
 from ident.attribute import Attribution, Candidate
 from ident.excitation import Plan, make_plan
-from ident.extended import predict
+from ident.extended import predict, simulated_laws
 from ident.graybox import Parameters, equilibrium, linearise
 from ident.information import motor_loads
 from ident.parallel import map_threads
@@ -156,6 +156,7 @@ def _peak(group: Group) -> np.ndarray:
 def _separation(problem: Problem, option: _Option, a: Fit, b: Fit) -> float:
     """Expected evidence, nats, for ``a`` against ``b`` refitted, and the other way round; the smaller."""
     group = option.group
+    a, b = (replace(x, model=simulated_laws(x.model)) for x in (a, b))  # there is no record of it yet
     try:
         preds = [predict(x.model, group, problem.sampling) for x in (a, b)]
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):

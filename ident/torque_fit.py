@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.columns import Columns
-from ident.extended import Effect, Model, Prediction, is_along_record, predict, predict_at
+from ident.extended import Effect, Model, Prediction, joints_along_record, predict, predict_at
 from ident.graybox import Parameters, Structure, parameter_names
 from ident.inverse import Motion, Sampling, baseline_products
 from ident.noise import residual_covariance, white_covariance
@@ -23,6 +23,7 @@ from ident.records import Group
 
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
 PRIOR_TIMING = 0.25  # of the common timing offset, samples
+TIMING_STEP = 1e-6  # s, for differences
 TIMING_LIMIT = 0.6  # samples
 ANNEALING = (0.5, 0.1, 0.02, 0.0)
 LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
@@ -130,20 +131,23 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
         samples=problem.samples(group),
     )
     k = np.arange(S.shape[1])
-    S = _with_laws(S, prediction.law_noise(group)[: group.n_compared])
+    more = prediction.record_noise(group)
+    if more is None:
+        S = S.copy()
+        S[:, k, k] += prediction.law_noise(group)[: group.n_compared]
+    else:
+        S = _with_record(S, more[: group.n_compared])
     if np.any(problem.step_std):
         variance = np.broadcast_to(np.square(problem.step_std) / problem.samples(group), k.shape)
         S += white_covariance(prediction.sampled_impedance[: group.n_compared], 0.0 * variance, variance)
     return S
 
 
-def _with_laws(S: np.ndarray, more: np.ndarray) -> np.ndarray:
-    """A covariance (K, n, n) and what laws add to it, by draws.
+def _with_record(S: np.ndarray, more: np.ndarray) -> np.ndarray:
+    """A covariance (K, n, n) and what answers to the record add to it, by draws.
 
     At least ``LEAST_NOISE`` of the former in any direction, and ``LEAK`` of the largest: draws know directions to so much.
     """
-    if not np.any(more):
-        return S.copy()
     root = np.linalg.cholesky(S)
     half = np.linalg.solve(root, more)
     relative = np.linalg.solve(root, np.conj(np.swapaxes(half, 1, 2)))
@@ -227,6 +231,9 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> 
     keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
     base = baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
     late = pred.plane.s[:top, None] * pred.solution.U[:, :top]
+    if joints_along_record(model, group):
+        later = replace(model, par=replace(model.par, timing=model.par.timing + TIMING_STEP))
+        late = (predict(later, group, problem.sampling, W=pred.solution.W).U - pred.U)[:, :top] / TIMING_STEP
     effects = [
         column[:, :top]
         for i in range(len(model.effects))
@@ -258,7 +265,8 @@ def _beside_gears(
         if e.hypothesis.channel == "spring" and not e.hypothesis.options.get("kinematic")
     ]
     moved = []
-    for c in sorted({f * n + h.joint for h in loops for f in range(4 if is_along_record(h) else 2)}):
+    along = joints_along_record(model, group)
+    for c in sorted({f * n + h.joint for h in loops for f in range(4 if h.joint in along else 2)}):
         x = pack(model)
         x[c] += 1e-3
         there = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W)
@@ -314,7 +322,7 @@ def _effect_columns(
             step = -step
             p[c] = q.to_external(x + step)
         steps.append((p, step))
-    if h.channel == "motor":
+    if h.channel == "motor" and not joints_along_record(model, group):
         return _motor_columns(model, group, pred, effect, steps)
     models = [
         Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))

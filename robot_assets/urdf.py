@@ -20,12 +20,14 @@ class Description:
     Attributes:
         links: names. limits: movable joint -> lower and upper position, rad or m.
         child: joint -> the link it carries. kinds: movable joint -> one of ``MOVABLE``.
+        axes: movable joint -> its axis in its own frame, of length one.
     """
 
     links: frozenset[str]
     limits: dict[str, tuple[float, float]]
     child: dict[str, str]
     kinds: dict[str, str]
+    axes: dict[str, tuple[float, float, float]]
 
 
 def read_urdf(path: Path) -> Description:
@@ -41,7 +43,7 @@ def read_urdf(path: Path) -> Description:
         double = {n for n in names if names.count(n) > 1}
         if double:
             raise DataError(f"{kind} {min(double)}", str(path), "it twice", "distinct names")
-    limits, child, parent, kinds = {}, {}, {}, {}
+    limits, child, parent, kinds, axes = {}, {}, {}, {}, {}
     for name, joint in joints:
         ends = []
         for end in ("parent", "child"):
@@ -59,12 +61,14 @@ def read_urdf(path: Path) -> Description:
             axis = _vector(joint.find("axis"), "xyz", f"axis of joint {name}", path, "1 0 0")
             if not np.any(axis):
                 raise DataError(f"axis of joint {name}", str(path), "a zero vector", "a direction")
+            x, y, z = np.asarray(axis) / np.linalg.norm(axis)
+            axes[name] = (float(x), float(y), float(z))
         elif joint.get("type") != "fixed":
             raise DataError(f"joint {name} type", str(path), repr(joint.get("type")), f"fixed or one of {MOVABLE}")
     _one_tree(links, parent, path)
     for element, link in zip(root.findall("link"), links, strict=True):
         _check_inertial(element.find("inertial"), link, path)
-    return Description(frozenset(links), limits, child, kinds)
+    return Description(frozenset(links), limits, child, kinds, axes)
 
 
 def _root(path: Path) -> ET.Element:

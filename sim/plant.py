@@ -93,7 +93,8 @@ def build_spec(
     spec.option.timestep = timestep
     spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
     spec.option.gravity = list(robot.gravity)
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    # A simulation that diverges is to be seen as one, not begun anew.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
     _add_chain(spec, robot, _hinges(robot, effects))
     for j, joint in enumerate(robot.joints):
         _add_drive(spec, joint.name, {f: figures[f][j] for f in DRIVE_FIELDS})

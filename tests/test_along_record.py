@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from ident.attribute import simulated
 from ident.diagnose import set_up
-from ident.extended import Effect, Model, along_record, as_loop, is_along_record
+from ident.extended import Effect, Model, along_record, is_along_record, joints_along_record, predict
 from ident.hypotheses import catalogue, kernels
-from ident.torque_fit import fit, joint_costs, make_weights, predictions
+from ident.torque_fit import fit, jacobian, joint_costs, make_weights, pack, predictions, unpack
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from tests.conftest import small_plan, through_files
@@ -95,7 +95,36 @@ def test_a_gear_that_rattles_is_explained_along_its_record_alone(rattling):
     result = fit(problem, start, iterations=15)
     assert result.model.effects[0].p[0] == pytest.approx(gap, rel=0.02)
     kept, _ = simulated(problem, along, result)
-    assert is_along_record(kept) and not is_along_record(as_loop(kept))
+    assert is_along_record(kept)
+
+
+def test_columns_beside_a_gear_along_its_record_are_the_differences(rattling):
+    """Of the gear, its motor, the timing and friction at the same joint, whose torque the record holds already."""
+    problem, model, backlash, gap = rattling
+    friction = next(h for h in catalogue(problem.structure) if h.key == ("coulomb_friction", "shoulder_pan_joint"))
+    effects = (Effect(along_record(backlash), np.array([gap])), Effect(friction, np.array([2.0, 0.1, 5e-3])))
+    model, group, n = replace(model, effects=effects), problem.groups[0], problem.structure.n
+    pred = predict(model, group, problem.sampling)
+    J, x = jacobian(problem, model, group, pred).dense(), pack(model)
+    m = len(model.par.to_log())
+    for c, step in ((0, 1e-4), (n, 1e-4), (2 * n, 1e-5), (3 * n, 1e-4), (m, 1e-6), (m + 1, 1e-4), (m + 2, 1e-4)):
+        ends = []
+        for sign in (1.0, -1.0):
+            y = x.copy()
+            y[c] += sign * step
+            ends.append(predict(unpack(model, y, np.inf), group, problem.sampling, W=pred.solution.W).U)
+        slope = (ends[0] - ends[1])[:, : J.shape[1]] / (2 * step)
+        assert np.linalg.norm(J[..., c] - slope) < 0.1 * np.linalg.norm(slope), c
+
+
+def test_a_drive_with_an_effect_is_predicted_by_the_loop(rattling):
+    """Its record is not the torque of the motor; that of another joint does not matter."""
+    problem, model, backlash, gap = rattling
+    named = {h.key: h for h in catalogue(problem.structure)}
+    along = Effect(along_record(backlash), np.array([gap]))
+    for joint, expected in (("shoulder_pan_joint", set()), ("elbow_joint", {0})):
+        constant = Effect(named["torque_constant", joint], np.array([0.9]))
+        assert joints_along_record(replace(model, effects=(along, constant)), problem.groups[0]) == expected
 
 
 def test_a_gear_with_one_steady_motion_ends_as_a_loop(tmp_path):

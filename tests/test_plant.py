@@ -5,8 +5,9 @@ import pytest
 
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
+from robot_assets.urdf import read_urdf
 from sim import EFFECTS, draw_effect, parse_effect, run_experiment
-from sim.effects import parameters_of, valid_places
+from sim.effects import make_effect, parameters_of, valid_places
 from sim.plant import build_plant, gravity_torque, rest
 from tests.conftest import small_plan
 
@@ -84,3 +85,20 @@ def test_a_wrong_effect_is_one_clear_error(ur10, text, found):
         return
     with pytest.raises(DataError, match=found):
         parse_effect(text, ur10)
+
+
+@pytest.mark.parametrize("name", ["ur10", "irb", "panda"])
+def test_an_elasticity_across_is_drawn_across(name):
+    robot = load_robot(name)
+    axes = read_urdf(robot.urdf).axes
+    for seed in range(30):
+        effect = draw_effect(np.random.default_rng(seed), robot, names=("transverse_elasticity",))
+        assert abs(np.dot(effect.axis, axes[effect.place])) < 0.9
+
+
+def test_a_simulation_that_diverges_is_an_error(ur10):
+    """A hinge without mass between, along the joint's own axis, has a singular inertia."""
+    axis = read_urdf(ur10.urdf).axes["shoulder_pan_joint"]
+    broken = make_effect("transverse_elasticity", "shoulder_pan_joint", stiffness=2e4, damping=30.0, axis=axis)
+    with pytest.raises(DataError, match="diverged"):
+        run_experiment(small_plan(ur10, 1, points=1, levels=(1.0,), period=200), [broken])

@@ -112,7 +112,7 @@ MORE_ARM = [
     make_effect("coulomb_friction", "elbow_joint", torque=3.0, asymmetry=0.1),
     make_effect("torque_delay", "shoulder_lift_joint", delay=1.3e-3),
     make_effect("hardening_stiffness", "shoulder_lift_joint", cubic=5e9),
-    make_effect("backlash", "shoulder_lift_joint", gap=1e-3),  # which the links' weight closes on one side
+    make_effect("backlash", "shoulder_lift_joint", gap=3e-4),  # which the links' weight closes on one side
     make_effect("gravity_spring", "elbow_joint", stiffness=40.0, rest_angle=0.3),
     make_effect("hysteresis", "elbow_joint", stiffness=8e3, yield_torque=4.0),
     make_effect("torque_saturation", "shoulder_lift_joint", limit=100.0),

@@ -149,6 +149,7 @@ def test_the_end_of_a_single_motion_is_held_out(ur10):
     assert with_held_out(short) is short
 
 
+@pytest.mark.slow
 def test_friction_is_named_beside_links_that_differ_from_their_description(moved, tmp_path):
     """One round: without the inertias of the links friction would be judged beside wrong torques."""
     result = diagnose_fully(through_files(moved, tmp_path), max_causes=1)

@@ -54,7 +54,8 @@ def catalogue(chain: Structure) -> tuple[Hypothesis, ...]:
         if index in seen or index == 0:
             continue
         seen.add(index)
-        out.append(structure.link_inertia(link, _joint_of_body(chain, index)))
+        carries = index == chain.bodies.get(robot.payload_link, (0, None))[0]
+        out.append(structure.link_inertia(link, _joint_of_body(chain, index), carries))
     for j, name in enumerate(names):
         out += [structure.compliance(name, j, axis, "transverse_elasticity") for axis in _across(chain, j)]
     for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):

@@ -105,7 +105,7 @@ class Hypothesis:
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
             place of one with parameters ``old`` at the same joint. ``essential`` names the parameter without
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm
-            may have several steady motions with it.
+            may have several steady motions with it. ``nats``: log odds before the data, 0 where there is no reason.
     """
 
     effect: str

@@ -35,6 +35,7 @@ from ident.inverse import (
 from ident.records import Group
 from robot_assets.robot import Elasticity
 
+LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
 SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
 
@@ -189,11 +190,14 @@ def payload(link: str) -> Hypothesis:
     )
 
 
-def link_inertia(link: str, joint_index: int) -> Hypothesis:
+def link_inertia(link: str, joint_index: int, carries_load: bool = False) -> Hypothesis:
     """Mass, centre of mass and inertia of a link are not those of the model.
 
     ``mass`` and ``inertia`` (about the centre of mass) are factors, ``com`` is a shift in the frame of
     the link's joint. The data seldom determine all of them: what they leave open stays near the model.
+
+    Args:
+        carries_load: whether a payload would be part of the same body.
     """
 
     def how(p) -> LinkChange:
@@ -227,6 +231,7 @@ def link_inertia(link: str, joint_index: int) -> Hypothesis:
         " what the model says, its centre of mass off by ({com_x:.3g}, {com_y:.3g}, {com_z:.3g}) m.",
         variable="posture",
         options={
+            "nats": -LOAD_NATS if carries_load else 0.0,
             "change": lambda p: Change(links=((link, how(p)),)),
             "responses": responses,
             "start": lambda c: np.array(

@@ -142,7 +142,7 @@ def replay(arm: Arm, group: Group, sampling: Sampling) -> Replay:
     s = 1j * group.omega[:, None]
     shift = np.exp(s * arm.timing)
     rest, hold = equilibrium(arm, group.posture)
-    Z = sampled_impedance(arm, rest, hold, group.omega, m) * np.exp(s * arm.delay)[:, None, :].swapaxes(1, 2)
+    Z = sampled_impedance(arm, rest, hold, group.omega, m) * np.exp(s * arm.delay)[:, :, None] * np.exp(s * arm.sensor_delay)[:, None, :]
     aim = group.Q * group.signal_share * np.exp(s * arm.sensor_delay)
     fed = group.U / shift
     fed[:, 0] -= arm.offset

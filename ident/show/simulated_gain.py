@@ -39,7 +39,7 @@ def simulated_gain(
     """Gain of an exported model over the identified one without effects, by simulation of both.
 
     The metric is that of the verdict's gain (``ident.gain``), with the torque of the simulated arms in the place of
-    predictions (``ident.show.replay``); the noise floor is the same.
+    predictions (``ident.show.replay``); the noise floor is that of the model without effects.
 
     Args:
         dataset: with held-out segments, or a single motion whose end is held out.

@@ -10,6 +10,7 @@ import numpy as np
 
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
+from robot_assets.urdf import read_urdf
 from sim.effects import drive, friction, sensing, structure, transmission
 
 _CLASSES = (
@@ -151,6 +152,8 @@ def draw_effect(
     side = rng.permutation(np.eye(3))[0]
     periods = float(rng.choice([2.0, 4.0])) * joint.gear_ratio / float(rng.choice([1.0, 2.0]))
     k = joint.stiffness
+    own = np.abs(read_urdf(robot.urdf).axes[joint.name])
+    across = side if own @ side < 0.9 else np.roll(side, 1)
     wrong_link: dict[str, object] = {"mass": 1 + 0.15 * size}
     if rng.random() < 0.7:
         wrong_link["inertia"] = 1 + 0.15 * size
@@ -175,7 +178,7 @@ def draw_effect(
         "joint_coupling": {"ratio": 0.1 * size},
         "payload": {"mass": 1.5 * size, "com_x": 0.02, "com_y": 0.0, "com_z": 0.08},
         "link_inertia": wrong_link,
-        "transverse_elasticity": {"stiffness": 0.7 * k / size, "damping": 6e-4 * k, "axis": tuple(float(v) for v in side)},
+        "transverse_elasticity": {"stiffness": 0.7 * k / size, "damping": 6e-4 * k, "axis": tuple(float(v) for v in across)},
         "base_elasticity": {"stiffness": 10 * k / size, "damping": 6e-3 * k, "axis": (1.0, 0.0, 0.0)},
         "gravity_spring": {"stiffness": 0.1 * joint.torque_limit * size, "rest_angle": float(rng.uniform(-1, 1))},
         "dress_pack": {"stiffness": 0.1 * joint.torque_limit * size, "friction": 0.3 * torque},
