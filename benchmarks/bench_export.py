@@ -21,7 +21,7 @@ from ident.extended import Effect, Model, along_record
 from ident.gain import measure_gain, segment_errors
 from ident.hypotheses import Hypothesis, catalogue
 from ident.show.export import NATIVE, build_mjcf, note_record
-from ident.show.simulated_gain import export_baseline, simulated_errors, spread, subset
+from ident.show.simulated_gain import export_baseline, simulated_errors, spread
 from ident.torque_fit import Fit, Problem, fit
 from ident.verdict import Cause, Gain
 from robot_assets.robot import Robot, load_robot
@@ -75,7 +75,7 @@ def both_gains(dataset: Dataset, effect, segments: int = 2) -> tuple[Gain, Gain]
     if hidden.hypothesis.options.get("bends"):
         hidden = replace(hidden, hypothesis=along_record(hidden.hypothesis))
     result = fit(problem, Model(problem.structure, problem.nominal, (hidden,)))
-    groups = tuple(subset(g, spread(len(g.segments), segments)) for g in setup.held_out)
+    groups = tuple(g.pick(spread(len(g.segments), segments)) for g in setup.held_out)
     predicted, _ = segment_errors(problem, groups, baseline.model, result.model)
     values = {k: v.value for k, v in baseline_values(result)[0].items()}
     after = build_mjcf(robot, values, [cause_of(e, result) for e in result.model.effects])

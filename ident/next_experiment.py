@@ -119,7 +119,7 @@ def _options(problem: Problem, groups: Sequence[Group], joint: int) -> Iterator[
     limit = TORQUE_SHARE * robot.array("torque_limit")
     for group in groups:
         rows = np.argsort(-group.amplitude, kind="stable")[:RECORDS]
-        top = thinned(group, rows[group.amplitude[rows] == group.amplitude.max()])
+        top = group.pick(rows[group.amplitude[rows] == group.amplitude.max()])
         for j in range(robot.n) if joint < 0 else (joint,):
             for factor in (1.0,) if joint < 0 else FACTORS:
                 if factor > 1.0 and np.any(np.abs(top.U[:, 0]).max(axis=0) + factor * _peak(top) > limit):
@@ -128,14 +128,6 @@ def _options(problem: Problem, groups: Sequence[Group], joint: int) -> Iterator[
                     inside = robot.q_min[j] < top.posture[j] + shift < robot.q_max[j]
                     if (factor, shift) != (1.0, 0.0) and (inside or shift == 0.0):
                         yield _Option(moved(top, factor, j, shift), factor, j, shift)
-
-
-def thinned(group: Group, rows: np.ndarray) -> Group:
-    """A group with some of its records."""
-    names = ("U", "Q", "U_periods", "Q_periods", "excited", "amplitude", "start", "periods")
-    kept = {name: getattr(group, name)[rows] for name in names}
-    kept |= {name: getattr(group, name)[rows] for name in ("Q_link", "temperature") if getattr(group, name) is not None}
-    return replace(group, segments=tuple(group.segments[i] for i in rows), **kept)
 
 
 def moved(group: Group, factor: float, joint: int, shift: float) -> Group:

@@ -7,7 +7,7 @@ keeps the return and the first transient out of every comparison.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -101,6 +101,13 @@ class Group:
     def posture(self) -> np.ndarray:
         """(n,) mean motor position, rad."""
         return self.Q[:, 0].real.mean(axis=0)
+
+    def pick(self, rows: np.ndarray) -> Group:
+        """The group with some of its segments."""
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods")
+        parts = {name: getattr(self, name) for name in names}
+        kept = {name: None if x is None else x[rows] for name, x in parts.items()}
+        return replace(self, segments=tuple(self.segments[i] for i in rows), **kept)
 
     def to_time(self, X: np.ndarray) -> np.ndarray:
         """Spectrum (..., L, m) on the time grid (..., n_time, m)."""

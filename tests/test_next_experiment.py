@@ -10,7 +10,7 @@ from ident.attribute import Candidate
 from ident.excitation import plan_from_toml, plan_to_toml
 from ident.extended import Effect, Model
 from ident.hypotheses import catalogue
-from ident.next_experiment import _Option, _separation, moved, separating_experiment, thinned
+from ident.next_experiment import _Option, _separation, moved, separating_experiment
 from ident.torque_fit import fit
 
 
@@ -32,7 +32,7 @@ def fitted(clean):
 
 def option(problem, factor, shift=0.0):
     group = next(g for g in problem.groups if g.window is None)
-    return _Option(moved(thinned(group, np.arange(2)), factor, 2, shift), factor, 2, shift)
+    return _Option(moved(group.pick(np.arange(2)), factor, 2, shift), factor, 2, shift)
 
 
 def test_a_model_is_not_separated_from_itself(fitted):

@@ -12,7 +12,7 @@ from ident.extended import Model, predict
 from ident.records import build_groups
 from ident.show.export import write_mjcf
 from ident.show.replay import equilibrium, load_arm, replay, sampled_impedance
-from ident.show.simulated_gain import export_baseline, spread, subset
+from ident.show.simulated_gain import export_baseline, spread
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import run_experiment
@@ -155,6 +155,6 @@ def test_without_held_out_segments_there_is_nothing_to_simulate(tmp_path):
 
 def test_a_few_segments_of_a_group_keep_their_order(clean_drive):
     group = build_groups(clean_drive, role="identification")[0]
-    chosen = subset(group, spread(len(group.segments), 1))
+    chosen = group.pick(spread(len(group.segments), 1))
     assert chosen.segments == group.segments[:1] and chosen.U.shape[0] == chosen.excited.shape[0] == 1
     assert list(spread(6, 3)) == [0, 2, 5] and list(spread(2, 4)) == [0, 1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -24,7 +23,6 @@ from ident.verdict import Gain
 from robot_assets.errors import DataError
 
 METRIC = "RMS error of the torque that the simulated motors need, N m"
-OF_SEGMENTS = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods")
 SEGMENTS = 4  # of each operating point that are simulated
 
 
@@ -58,7 +56,7 @@ def simulated_gain(
     if not setup.held_out:
         raise DataError("segments", dataset.name, "none of role validation", "at least one to simulate")
     problem = setup.problem
-    groups = tuple(subset(g, spread(len(g.segments), segments)) for g in setup.held_out)
+    groups = tuple(g.pick(spread(len(g.segments), segments)) for g in setup.held_out)
     affected = affected_joints(problem, baseline, predictions(problem, baseline.model, baseline.remainders))
     if progress is not None:
         progress("simulation of both models")
@@ -111,10 +109,3 @@ def simulated_errors(
 def spread(count: int, most: int) -> np.ndarray:
     """At most ``most`` of ``count`` indices, over the whole range."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-
-
-def subset(group: Group, index: np.ndarray) -> Group:
-    """Some segments of a group."""
-    parts = {name: getattr(group, name) for name in OF_SEGMENTS}
-    chosen = {name: None if x is None else x[index] for name, x in parts.items()}
-    return replace(group, segments=tuple(group.segments[i] for i in index), **chosen)
