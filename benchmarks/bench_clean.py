@@ -17,11 +17,10 @@ from pathlib import Path
 import numpy as np
 from provenance import commit
 
-from ident.attribute import DETECTION_EXCESS, DETECTION_LEVEL, discrepancy_p_value
+from ident.attribute import DETECTION_EXCESS, DETECTION_LEVEL, UNDETERMINED, discrepancy_p_value
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import identify
 from ident.excitation import operating_points
-from ident.trust import UNDETERMINED
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import draw_drives, plan_experiment

@@ -45,7 +45,7 @@ from ident.predict import Noise, PredictionFit, Runs, fit_prediction, runs_of
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, load_robot
 from sim import run_experiment
-from sim.experiment import _gains, draw_drives, plan_experiment
+from sim.experiment import draw_drives, loop_gains, plan_experiment
 from sim.loop import Controller, run_loop
 from sim.loop import Noise as LoopNoise
 from sim.plant import DRIVE_FIELDS, build_plant, build_spec, link_inertia_diagonal, rest
@@ -140,7 +140,7 @@ def output_error(case: Case) -> Callable[[Parameters], Parameters]:
     q0 = np.stack([s.q0 for s in segments])
     r = np.stack([s.r for s in segments])
     true = build_plant(robot, drives=drives_of(case.truth))
-    kp, kd = (np.stack(g) for g in zip(*(_gains(link_inertia_diagonal(true, q)) for q in q0), strict=True))
+    kp, kd = (np.stack(g) for g in zip(*(loop_gains(link_inertia_diagonal(true, q)) for q in q0), strict=True))
     loop = Controller(kp, np.zeros_like(kp), kd, np.stack([rest(true, q)[1] for q in q0]))
     silent = LoopNoise(*np.zeros((3, robot.n)))
     skip, samples = case.runs.skip, r.shape[1]
@@ -225,7 +225,7 @@ def peer(case: Case) -> Callable[[Parameters], Parameters] | None:
         sequences = []
         for p, q0 in enumerate(runs.q0):
             plant = build_plant(robot, drives=drives_of(x))
-            kp, kd = _gains(link_inertia_diagonal(plant, q0))
+            kp, kd = loop_gains(link_inertia_diagonal(plant, q0))
             spec = servoed(x, kp, kd)
             model, mine = spec.compile(), np.flatnonzero(runs.point == p)
             state = create_initial_state(model, rest(plant, q0)[0])

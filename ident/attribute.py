@@ -550,7 +550,8 @@ def beside_strong(
     A strong effect that is missing moves the drives to where none of its steps leads back, and with
     them the noise that the model passes on: a joint that sticks looks like one without motor inertia.
     Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
-    gear first along the record, where nothing depends on how a loop moves under parameters that are not right yet.
+    gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
+    as loops where these do as well.
     """
 
     def annealed(score: Score) -> Fit | None:

@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.excitation import Excitation, Experiment, Part, Plan, Schedule, Trajectory, point_to_point
+from ident.excitation import Experiment, Part, Plan, Schedule, Trajectory, point_to_point
 from robot_assets.errors import DataError
 
 SETTLE = 1.0  # s of rest after a move; the transient periods of the first experiment follow it
 OFF_POSTURE = 0.1  # rad (m), mean distance from the planned posture beyond which a recording is of something else
-CHANNELS = ("tau", "q", "qd", "q_link", "temp")
 
 
 @dataclass(frozen=True)
@@ -134,25 +133,10 @@ def _segment(whole: Segment, schedule: Schedule, part: Part, source: Experiment 
     if not off[worst] < OFF_POSTURE:
         found = f"q_{worst + 1} on average {off[worst]:.3g} off the planned posture"
         raise DataError("posture", f"{source.name}, samples {part.start} to {part.stop}", found, f"less than {OFF_POSTURE:g}")
-    channels = {k: v[part.samples] for k in CHANNELS if (v := getattr(whole, k)) is not None}
-    channels["t"] = whole.t[part.samples]
+    channels = whole.part(part.samples)
+    # Motions and excitation of the whole recording stand in the plan; what was injected may be better known.
+    channels.pop("q_ref", None)
+    r = channels.pop("r", schedule.r[part.samples])
     if isinstance(source, Trajectory):
         return Segment(name=source.name, kind="trajectory", role=source.role, q_ref=source.q_ref, **channels)
-    r = schedule.r if whole.r is None else whole.r
-    return Segment(
-        name=source.name, kind="multisine", role=source.role, r=r[part.samples], **channels, **_labels(source, schedule.plan.excitation)
-    )
-
-
-def _labels(e: Experiment, x: Excitation) -> dict:
-    return dict(
-        operating_point=e.operating_point,
-        q0=e.q0,
-        period=x.period,
-        periods=x.periods,
-        transient_periods=x.transient_periods,
-        experiment=e.experiment,
-        realization=e.realization,
-        amplitude=e.amplitude,
-        excited_lines=x.lines,
-    )
+    return Segment(r=r, **channels, **source.labels(schedule.plan.excitation))

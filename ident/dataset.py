@@ -53,6 +53,11 @@ class Segment:
     def n_samples(self) -> int:
         return len(self.t)
 
+    def part(self, rows: slice) -> dict[str, np.ndarray]:
+        """Time and the channels that there are, some of their samples."""
+        names = ("t", "tau", "q", "qd", "r", "q_ref", "q_link", "temp")
+        return {name: x[rows] for name in names if (x := getattr(self, name)) is not None}
+
     @property
     def steady_periods(self) -> int:
         """Periods left when the transient ones are discarded."""

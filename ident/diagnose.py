@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.attribute import NOT_COMPUTED, Attribution, attribute, fit_baseline
 from ident.conclude import baseline_values, conclude, named_effects
-from ident.dataset import Dataset, Segment
+from ident.dataset import Dataset
 from ident.extended import Effect, predict
 from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import (
@@ -108,14 +108,9 @@ def with_held_out(dataset: Dataset) -> Dataset:
     if (whole.n_samples - cut) / dataset.sample_rate < LEAST_HELD_OUT:
         return dataset
 
-    def part(rows: slice, name: str, role: str) -> Segment:
-        channels = {
-            c: getattr(whole, c)[rows] for c in ("t", "tau", "q", "qd", "r", "q_ref", "q_link", "temp") if getattr(whole, c) is not None
-        }
-        return replace(whole, name=name, role=role, **channels)
-
-    ends = part(slice(None, cut), whole.name, "identification"), part(slice(cut, None), f"{whole.name}-end", "validation")
-    return replace(dataset, segments=ends)
+    first = replace(whole, role="identification", **whole.part(slice(None, cut)))
+    last = replace(whole, name=f"{whole.name}-end", role="validation", **whole.part(slice(cut, None)))
+    return replace(dataset, segments=(first, last))
 
 
 def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) -> float:

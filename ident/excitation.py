@@ -12,6 +12,7 @@ import tempfile
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tomlkit
@@ -70,6 +71,23 @@ class Experiment:
     def name(self) -> str:
         """Name of its segment."""
         return f"{self.operating_point}-a{self.amplitude:g}-e{self.experiment}-r{self.realization}"
+
+    def labels(self, x: Excitation) -> dict[str, Any]:
+        """What its segment says of it, run with excitation ``x``, beside the samples."""
+        return dict(
+            name=self.name,
+            kind="multisine",
+            role=self.role,
+            operating_point=self.operating_point,
+            q0=self.q0,
+            period=x.period,
+            periods=x.periods,
+            transient_periods=x.transient_periods,
+            experiment=self.experiment,
+            realization=self.realization,
+            amplitude=self.amplitude,
+            excited_lines=x.lines,
+        )
 
 
 @dataclass(frozen=True)

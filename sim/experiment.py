@@ -154,23 +154,12 @@ def _multisines(
     t = np.arange(N) / x.sample_rate
     return [
         Segment(
-            name=e.name,
-            kind="multisine",
-            role=e.role,
             t=start[s] + t,
             tau=record.tau[s],
             q=record.q[s],
             q_link=record.q_link[s] if link_encoders else None,
             r=np.tile(r[s], (x.periods, 1)),
-            operating_point=e.operating_point,
-            q0=e.q0,
-            period=x.period,
-            periods=x.periods,
-            transient_periods=x.transient_periods,
-            experiment=e.experiment,
-            realization=e.realization,
-            amplitude=e.amplitude,
-            excited_lines=x.lines,
+            **e.labels(x),
         )
         for s, e in enumerate(plan.experiments)
     ]

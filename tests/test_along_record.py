@@ -61,6 +61,10 @@ def test_the_mean_torque_is_met_and_the_law_is_the_law(code, seed, mean, size):
     if code == kernels.BACKLASH:
         assert np.mean(k * (x + offset) + h) == pytest.approx(mean, abs=1e-6) or np.abs(x + offset).max() <= 0.5 * a
         assert h == pytest.approx(-k * np.clip(x + offset, -0.5 * a, 0.5 * a), abs=1e-5)
+    if code == kernels.SOFTENING:
+        assert h == pytest.approx((a - k) * np.clip(x + offset, -b, b), abs=1e-5)
+    if code == kernels.HYSTERESIS:
+        assert h == pytest.approx(kernels.elastoplastic(x + offset, a, b), abs=1e-6)
     if code == kernels.CUBIC:
         assert h == pytest.approx(a * (x + offset) ** 3, abs=1e-6)
 

@@ -1,6 +1,7 @@
 """The arrows of the architecture."""
 
 import ast
+import importlib
 from pathlib import Path
 
 import pytest
@@ -35,3 +36,9 @@ def test_sim_knows_the_data_and_no_model_of_ident(path):
 @pytest.mark.parametrize("path", sorted(ROOT.glob("robot_assets/**/*.py")), ids=str)
 def test_assets_know_no_engine(path):
     assert not {m.split(".")[0] for m in imports(path)} & {"sim", "ident", "mujoco", "pinocchio"}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
+def test_every_benchmark_can_be_imported(path, monkeypatch):
+    monkeypatch.syspath_prepend(str(path.parent))
+    importlib.import_module(path.stem)
