@@ -17,6 +17,7 @@ from sim.plant import DRIVE_FIELDS, Plant, build_plant, gravity_torque, link_ine
 DAMPING_RATIO = 0.7
 PROCESS_SHARE = 0.5  # of the torque noise that really acts on the motor, in units of tau_std
 PAUSE = 2.0  # s between two segments
+FEED_FORWARD_EVERY = 20  # samples of a motion between postures whose holding torque is looked at
 
 
 def draw_drives(rng: np.random.Generator, robot: Robot, factor: float = 2.0) -> dict[str, np.ndarray]:
@@ -173,8 +174,8 @@ def _motion(
     inertia = link_inertia_diagonal(plant, ref[0])
     kp, kd = loop_gains(inertia)
     qpos, _ = rest(plant, ref[0])
-    at = np.arange(0, len(ref), 20)
-    coarse = np.stack([gravity_torque(plant, ref[k]) for k in at])
+    at = np.arange(0, len(ref), FEED_FORWARD_EVERY)
+    coarse = np.stack([rest(plant, ref[k])[1] for k in at])
     ff = np.stack([np.interp(np.arange(len(ref)), at, c) for c in coarse.T], axis=1)
     acceleration = np.gradient(np.gradient(ref, axis=0), axis=0) * rate**2
     ff = ff + inertia * acceleration + plan.robot.array("viscous_friction") * np.gradient(ref, axis=0) * rate

@@ -102,3 +102,12 @@ def test_a_simulation_that_diverges_is_an_error(ur10):
     broken = make_effect("transverse_elasticity", "shoulder_pan_joint", stiffness=2e4, damping=30.0, axis=axis)
     with pytest.raises(DataError, match="diverged"):
         run_experiment(small_plan(ur10, 1, points=1, levels=(1.0,), period=200), [broken])
+
+
+@pytest.mark.parametrize("hidden", ["joint_coupling@wrist_2_joint:ratio=0.3", "gravity_spring@elbow_joint:stiffness=300,rest_angle=1.0"])
+def test_motions_are_followed_whatever_is_hidden(ur10, hidden):
+    plan = small_plan(ur10, 1, points=1, levels=(1.0,), validation_points=0, period=500, periods=2, trajectory=True)
+    data = run_experiment(plan, [parse_effect(hidden, ur10)], noise=0.0)
+    (motion,) = data.select(kind="trajectory")
+    assert np.allclose(motion.q[:20], motion.q_ref[:20], atol=1e-9)
+    assert np.abs(motion.q - motion.q_ref).max() < 0.1
