@@ -494,12 +494,21 @@ def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
 
 
 def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:
-    """Candidates that a few steps have not shown to be far behind the best."""
+    """Candidates that a few steps have not shown to be far behind the best.
+
+    The one that screening puts first is kept: where the drives have taken its place, as a stiffer gear takes that of
+    one that yields late, the first steps lead uphill.
+
+    Args:
+        found: in the order of their scores.
+    """
     ranked = sorted(found, key=lambda x: x[1].cost)
     limit = HOPELESS_RATIO * max(ranked[0][1].cost - ranked[0][1].count, 0.0) if ranked else 0.0
-    return [
+    kept = [
         (h, r) for i, (h, r) in enumerate(ranked[:HOPEFUL]) if i < FINALISTS or (r.cost - r.count < limit and not r.converged)
     ]
+    first = [(h, r) for h, r in found[:1] if not r.converged and all(h is not k for k, _ in kept)]
+    return [*kept, *first]
 
 
 def refit(
@@ -599,7 +608,7 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
 def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:
     """A law of the gear that was fitted along the record, as the loop that it is where that reaches the noise, or nearly.
 
-    It does not where the arm has several steady motions: it rattles, or its gear bends a resonance over.
+    It does not where the arm rattles, and has several steady motions.
     """
     loop = as_loop(h)
     *others, last = result.model.effects

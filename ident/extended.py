@@ -12,6 +12,7 @@ import scipy.fft
 from ident.graybox import Parameters, Structure, damping_diagonal, impedance, stiffness_diagonal
 from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import Hypothesis
+from ident.hypotheses.loop import modal_state, steady_loop
 from ident.hypotheses.structure import Change, apply_change
 from ident.inverse import (
     REMAINDER_STEPS,
@@ -159,7 +160,13 @@ def joints_along_record(model: Model, group: Group) -> set[int]:
 
 
 def predict(
-    model: Model, group: Group, sampling: Sampling, *, W: np.ndarray | None = None, steps: int | None = None
+    model: Model,
+    group: Group,
+    sampling: Sampling,
+    *,
+    W: np.ndarray | None = None,
+    steps: int | None = None,
+    torques: Torques = Torques(),
 ) -> Prediction:
     """Recorded motor torque along the measured motion of a group, effects included.
 
@@ -167,10 +174,11 @@ def predict(
         W: (S, L, N) geometric remainder to start from (of an earlier prediction with the same
             chain); None starts cold.
         steps: fixed-point steps on it; ``REMAINDER_STEPS`` cold and 0 warm where None.
+        torques: of laws of the gear and the links, to start from (of a model near by with the same chain).
     """
     structure, par = model.built()
     plane = make_plane(structure, par, group, sampling)
-    return predict_at(model, structure, par, plane, group, sampling, W=W, steps=steps)
+    return predict_at(model, structure, par, plane, group, sampling, W=W, steps=steps, torques=torques)
 
 
 def predict_at(
@@ -183,6 +191,7 @@ def predict_at(
     *,
     W: np.ndarray | None = None,
     steps: int | None = None,
+    torques: Torques = Torques(),
 ) -> Prediction:
     """``predict`` with the linear arm already at hand."""
     if steps is None:
@@ -204,7 +213,8 @@ def predict_at(
     inner.sort(key=lambda e: e.hypothesis.joint in along and is_along_record(e.hypothesis))  # after what else is at the gear
     react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor, along=along) if inner else None
     passes = 1 if len(inner) == 1 and _closes_itself(inner[0]) else REACTION_STEPS
-    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, react=react, passes=passes, steps=steps)
+    start = torques if inner else Torques()
+    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps)
     U = solution.U
     if motor:
         U = U + plane.record[:, None] * _motor_torques(par, Motion(group, solution, par), motor)
@@ -272,8 +282,9 @@ def _inner_torques(
         compliance = plane.A_inv[:, c, c]
         grid, modes = _modes(structure, par, plane, group, c)
         if effect.hypothesis.channel == "link":
-            free = solution.Q_a[..., c] + compliance * (old_link[..., c] - at_link.get(j, 0.0))
-            at_link[j] = at_link.get(j, 0.0) + _loop(effect.hypothesis.options["loop"](effect.p), grid, free, modes)
+            others = at_link.get(j, 0.0)
+            guess = old_link[..., c] - others
+            at_link[j] = others + _loop(effect.hypothesis.options["loop"](effect.p), grid, solution.Q_a[..., c] + compliance * guess, modes, guess)
         else:
             others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
@@ -282,8 +293,8 @@ def _inner_torques(
                 at_gear[j] = others + said
                 motor[..., j] += left
             else:
-                free = solution.delta[..., j] + compliance * (old_gear[..., j] - others)
-                at_gear[j] = others + _loop(law, grid, free, modes)
+                guess = old_gear[..., j] - others
+                at_gear[j] = others + _loop(law, grid, solution.delta[..., j] + compliance * guess, modes, guess)
     for j, value in at_gear.items():
         old_gear[..., j] = value
     for j, value in at_link.items():
@@ -386,7 +397,7 @@ def _closes_itself(effect: Effect) -> bool:
 
 def _modes(
     structure: Structure, par: Parameters, plane: Plane, group: Group, column: int
-) -> tuple[Group, tuple[np.ndarray, ...]]:
+) -> tuple[Group, np.ndarray]:
     """Time grid of a loop at a link coordinate, fine enough for the fastest mode, and the modes there."""
     D = np.diag(damping_diagonal(structure, par))
     K = np.diag(stiffness_diagonal(structure, par)) + plane.lin.Kg
@@ -398,12 +409,17 @@ def _modes(
 
 
 def _loop(
-    law: tuple[int, float, float, float], grid: Group, free: np.ndarray, modes: tuple[np.ndarray, ...]
+    law: tuple[int, float, float, float], grid: Group, free: np.ndarray, modes: np.ndarray, guess: np.ndarray
 ) -> np.ndarray:
-    """Spectrum (S, L) of the torque of a law in steady state with the arm, from where it would be without."""
+    """Spectrum (S, L) of the torque of a law in steady state with the arm.
+
+    Args:
+        free: (S, L) where the arm would be without; guess: (S, L) torque to begin with.
+    """
     x = grid.to_time(free[..., None])[..., 0]
     rate = grid.to_time((1j * grid.omega * free)[..., None])[..., 0] if law[0] == kernels.LINK else x
-    return grid.to_lines(kernels.steady_loop(*law, x, rate, *modes)[..., None])[..., 0]
+    start = modal_state(guess, grid.omega, grid.period_time / grid.n_time, modes)
+    return grid.to_lines(steady_loop(law, x, rate, modes, start)[..., None])[..., 0]
 
 
 def _link_view(motion: Motion, joint: int, column: int) -> Motion:

@@ -31,12 +31,12 @@ from ident.graybox import (
     impedance,
     linearise,
 )
+from ident.mixing import MEMORY, mixed
 from ident.records import Group
 from ident.recursion import chain_of, newton_euler
 
 REMAINDER_STEPS = 60  # fixed-point steps at most for the geometric remainder from a cold start
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
-MEMORY = 6  # past iterates that are mixed
 REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
 REACTION_CHANGE = 1e-5  # relative change that ends them
 
@@ -259,34 +259,12 @@ def solve(
         if not np.all(np.isfinite(change)):
             raise FloatingPointError("the motion of the links cannot be solved")
         past = [*past[-MEMORY:], (W, change)]
-        W = _accelerated(past)
+        W = mixed(past)
         if react is not None:
             torques = _settle(structure, par, plane, Q, W, torques, react, passes)
         if np.abs(change).max() < REMAINDER_CHANGE * np.abs(W).max():
             break
     return _solution(structure, par, plane, Q, W, torques)
-
-
-def _accelerated(past: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Next iterate of the fixed point ``x = x + change(x)``, for every segment by itself.
-
-    Anderson mixing: the combination of past iterates whose changes cancel best. Plain steps
-    overshoot where a large motion meets a resonance of the links (Walker and Ni, SIAM J. Numer.
-    Anal. 49, 2011).
-
-    Args:
-        past: iterates and their changes, (S, L, N) each, the newest last.
-    """
-    x, f = past[-1]
-    if len(past) == 1:
-        return x + f
-    dx = np.stack([x - a for a, _ in past[:-1]])
-    df = np.stack([f - b for _, b in past[:-1]])
-    A = np.einsum("aslj,bslj->sab", df.conj(), df, optimize=True).real
-    b = np.einsum("aslj,slj->sa", df.conj(), f, optimize=True).real
-    ridge = 1e-12 * np.trace(A, axis1=1, axis2=2) + 1e-300
-    share = np.linalg.solve(A + ridge[:, None, None] * np.eye(len(dx)), b[..., None])[..., 0]
-    return x + f - np.einsum("aslj,sa->slj", dx + df, share, optimize=True)
 
 
 def _settle(

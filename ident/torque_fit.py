@@ -16,7 +16,7 @@ import numpy as np
 from ident.columns import Columns
 from ident.extended import Effect, Model, Prediction, joints_along_record, predict, predict_at
 from ident.graybox import Parameters, Structure, parameter_names
-from ident.inverse import Motion, Sampling, baseline_products
+from ident.inverse import Motion, Sampling, Torques, baseline_products
 from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
 from ident.records import Group
@@ -269,7 +269,7 @@ def _beside_gears(
     for c in sorted({f * n + h.joint for h in loops for f in range(4 if h.joint in along else 2)}):
         x = pack(model)
         x[c] += 1e-3
-        there = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W)
+        there = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W, torques=pred.solution.torques)
         moved.append((c, (there.U - pred.U)[:, : columns.whole.shape[1]] / 1e-3))
     if not moved:
         return columns
@@ -334,7 +334,7 @@ def _effect_columns(
         moved = [predict(m, group, sampling, W=W, steps=1).U for m in models]
     else:
         base = pred.U
-        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, sampling, W=W).U for m in models]
+        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, sampling, W=W, torques=pred.solution.torques).U for m in models]
     return [(U - base) / step for U, (_, step) in zip(moved, steps, strict=True)]
 
 
@@ -436,7 +436,7 @@ def fit(
                 if not np.all(np.isfinite(step)):
                     raise FloatingPointError("a step without a size")
                 trial = unpack(model, x + step, limit)
-                new = predictions(problem, trial, Ws, steps=trial_steps)
+                new = predictions(problem, trial, Ws, steps=trial_steps, near=preds)
                 new_cost = weighted_cost(problem, new, weights)
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                 new_cost = np.inf
@@ -483,7 +483,7 @@ def _settled(problem: Problem, last: Settled, model: Model, weights: Weights) ->
     """
     for steps in (1, SETTLING_STEPS):
         try:
-            preds = predictions(problem, model, last[2], steps=steps)
+            preds = predictions(problem, model, last[2], steps=steps, near=last[1])
             cost = weighted_cost(problem, preds, weights)
         except (np.linalg.LinAlgError, FloatingPointError, ValueError):
             continue
@@ -523,12 +523,21 @@ def _clip_effects(model: Model, step: np.ndarray) -> np.ndarray:
 
 
 def predictions(
-    problem: Problem, model: Model, remainders: Sequence[np.ndarray | None], steps: int | None = 0
+    problem: Problem,
+    model: Model,
+    remainders: Sequence[np.ndarray | None],
+    steps: int | None = 0,
+    near: Sequence[Prediction] = (),
 ) -> list[Prediction]:
-    """What a model predicts for all records, from geometric remainders near their own."""
+    """What a model predicts for all records, from geometric remainders near their own.
+
+    Args:
+        near: predictions of a model with the same effects, with whose torques loops begin; from rest where empty.
+    """
+    torques = [p.solution.torques for p in near] or [Torques()] * len(problem.groups)
     return map_threads(
-        lambda pair: predict(model, pair[0], problem.sampling, W=pair[1], steps=steps),
-        zip(problem.groups, remainders, strict=True),
+        lambda of: predict(model, of[0], problem.sampling, W=of[1], steps=steps, torques=of[2]),
+        zip(problem.groups, remainders, torques, strict=True),
     )
 
 

@@ -11,7 +11,6 @@ from numba import njit
 
 TURNED = 19.1  # argument beyond which tanh is one in double precision
 VECTORS = {"contract", "reassoc", "nsz"}  # what lets the compiler step several records at once
-SWEEPS = 25  # periods at most until the steady state
 CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK = 0, 1, 2, 3, 4
 
 
@@ -164,126 +163,113 @@ def along_deflection(
 
 
 @njit(cache=True, nogil=True)
-def link_point(
-    stiffness: float, friction: float, turn: float, q: float, v: float, dq: float, dv: float, h: float
-) -> float:
+def link_point(stiffness: float, friction: float, turn: float, q: float, v: float, dq: float, dv: float) -> float:
     """Torque that solves ``h = stiffness (q - dq h) + friction tanh((v - dv h) / turn)``.
 
-    The difference of both sides rises with ``h``: Newton's steps, halved where they leave the bracket.
+    By Newton's steps on the velocity that is left, in units of ``turn``: from zero, where the difference of both sides
+    is steepest, they never overshoot.
     """
     slope = 1.0 + stiffness * dq
-    low, high = (stiffness * q - friction) / slope, (stiffness * q + friction) / slope
-    h = min(max(h, low), high)
+    wanted = v * slope - dv * stiffness * q  # slope turn z + dv friction tanh(z)
+    size, line, jump = abs(wanted), slope * turn, dv * friction
+    z, y = size / (line + jump), 1.0
     for _ in range(60):
-        y = np.tanh((v - dv * h) / turn)
-        value = slope * h - stiffness * q - friction * y
-        if value > 0:
-            high = h
-        else:
-            low = h
-        new = h - value / (slope + friction * dv / turn * (1.0 - y * y))
-        if not low <= new <= high:
-            new = 0.5 * (low + high)
-        if abs(new - h) <= 1e-9 * friction:
-            return new
-        h = new
-    return h
+        if z > TURNED:
+            y = 1.0
+            break
+        y = 1.0 - 2.0 / (np.exp(2.0 * z) + 1.0)
+        bend = 1.0 - y * y
+        step = (size - line * z - jump * y) / (line + jump * bend)
+        z += step
+        if step <= 1e-5 * z + 1e-12:  # the next one would be of its square
+            y += bend * step
+            break
+    return (stiffness * q + (friction * y if wanted >= 0 else -friction * y)) / slope
 
 
 @njit(cache=True, nogil=True, fastmath=VECTORS)
-def steady_loop(
+def loop_sweep(
     code: int,
     a: float,
     b: float,
     k: float,
     linear: np.ndarray,
     rate: np.ndarray,
-    poles: np.ndarray,
-    decay: np.ndarray,
-    gain_old: np.ndarray,
-    gain_new: np.ndarray,
-) -> np.ndarray:
-    """Steady state of a law that moves the arm by which it is moved; (S, T) torque ``h``.
-
-    ``x = linear - r * h(x, x')`` with ``r`` the compliance of the arm at the law, as a sum of modes stepped
-    with a first-order hold: ``x+ = decay x + gain_old h + gain_new h+``. The velocity is that of the modes
-    (residues add up to zero: a torque does not step a velocity). All records are stepped side by side.
+    modes: np.ndarray,
+    start: np.ndarray,
+    memory: np.ndarray,
+    out: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """One period of a law that moves the arm by which it is moved (see ``loop.steady_loop``).
 
     Args:
         code, a, b, k: law. Of a gear, its two parameters and the linear stiffness, N m/rad; ``LINK``:
             ``a x + b tanh(x' / k)`` on a link.
-        linear, rate: (S, T) position and velocity without ``h``, rad, rad/s; the latter for ``LINK`` alone.
-        poles, decay, gain_old, gain_new: (modes,) complex.
+        linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
+        modes: (4, modes) complex: poles, decay, gain_old, gain_new.
+        start: (modes, S) complex state of the modes one step before the period.
+        memory: (3, S) deflection, the one before and torque there; replaced by those at the end.
+        out: (T, S) torque, N m; that of an earlier sweep is replaced.
+
+    Returns:
+        (modes, S) state at the end, and (S,) largest change of the torque over the largest torque.
     """
-    S, T = linear.shape
-    modes = len(decay)
-    linear, rate = linear.T.copy(), rate.T.copy()
-    out = np.zeros((T, S))
+    T, S = linear.shape
+    poles, decay, gain_old, gain_new = modes
     # A mode without the share of the torque of this step: that of the next one follows from both in one go.
     gain = decay * gain_new + gain_old
-    whole = decay**T
     direct = gain_new.real.sum()
     direct_rate = (poles * gain_new).real.sum()
-    re, im = np.zeros((modes, S)), np.zeros((modes, S))
-    start = np.zeros((modes, S), np.complex128)
-    x, past, h = np.empty(S), np.empty(S), np.empty(S)
+    re, im = np.empty((len(decay), S)), np.empty((len(decay), S))
+    end = np.empty((len(decay), S), np.complex128)
+    x, past, h = memory
     free, free_rate = np.empty(S), np.zeros(S)
-    change, largest = np.zeros(S), np.zeros(S)
-    for i in range(S):
-        x[i] = past[i] = linear[T - 1, i]
-        h[i] = a * x[i] + b * np.tanh(rate[T - 1, i] / k) if code == 4 else spring_torque(code, a, b, k, x[i], x[i], 0.0)
-    for sweep in range(SWEEPS):
-        for m in range(modes):
+    change, largest = np.zeros(S), np.full(S, 1e-300)
+    for m in range(len(decay)):
+        for i in range(S):
+            state = decay[m] * start[m, i] + gain_old[m] * h[i]
+            re[m, i], im[m, i] = state.real, state.imag
+    for t in range(T):
+        for i in range(S):
+            free[i] = linear[t, i]
+        for m in range(len(decay)):
             for i in range(S):
-                state = decay[m] * start[m, i] + gain_old[m] * h[i]
-                re[m, i], im[m, i] = state.real, state.imag
-        change[:] = 0.0
-        largest[:] = 0.0
-        for t in range(T):
+                free[i] -= re[m, i]
+        if code == 4:
             for i in range(S):
-                free[i] = linear[t, i]
-            for m in range(modes):
+                free_rate[i] = rate[t, i]
+            for m in range(len(decay)):
+                p, w = poles[m].real, poles[m].imag
                 for i in range(S):
-                    free[i] -= re[m, i]
-            if code == 4:
-                for i in range(S):
-                    free_rate[i] = rate[t, i]
-                for m in range(modes):
-                    p, w = poles[m].real, poles[m].imag
-                    for i in range(S):
-                        free_rate[i] -= p * re[m, i] - w * im[m, i]
-                for i in range(S):
-                    h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate, h[i])
-            else:
-                for i in range(S):
-                    new = spring_point(code, a, b, k, free[i], direct, x[i], past[i], h[i])
-                    h[i] = spring_torque(code, a, b, k, new, x[i], h[i])
-                    past[i] = x[i]
-                    x[i] = new
-            for m in range(modes):
-                d, e, f, g = decay[m].real, decay[m].imag, gain[m].real, gain[m].imag
-                for i in range(S):
-                    old = re[m, i]
-                    re[m, i] = d * old - e * im[m, i] + f * h[i]
-                    im[m, i] = d * im[m, i] + e * old + g * h[i]
+                    free_rate[i] -= p * re[m, i] - w * im[m, i]
             for i in range(S):
-                change[i] = max(change[i], abs(h[i] - out[t, i]))
-                largest[i] = max(largest[i], abs(h[i]))
-                out[t, i] = h[i]
-        if sweep > 0 and np.all(change <= 1e-5 * largest):
-            break
-        for m in range(modes):
+                h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
+        else:
             for i in range(S):
-                # The state that the torque of this period repeats.
-                end = (complex(re[m, i], im[m, i]) - gain_old[m] * h[i]) / decay[m]
-                start[m, i] = (end - whole[m] * start[m, i]) / (1.0 - whole[m])
-    return out.T.copy()
+                new = spring_point(code, a, b, k, free[i], direct, x[i], past[i], h[i])
+                h[i] = spring_torque(code, a, b, k, new, x[i], h[i])
+                past[i] = x[i]
+                x[i] = new
+        for m in range(len(decay)):
+            d, e, f, g = decay[m].real, decay[m].imag, gain[m].real, gain[m].imag
+            for i in range(S):
+                old = re[m, i]
+                re[m, i] = d * old - e * im[m, i] + f * h[i]
+                im[m, i] = d * im[m, i] + e * old + g * h[i]
+        for i in range(S):
+            change[i] = max(change[i], abs(h[i] - out[t, i]))
+            largest[i] = max(largest[i], abs(h[i]))
+            out[t, i] = h[i]
+    for m in range(len(decay)):
+        for i in range(S):
+            end[m, i] = (complex(re[m, i], im[m, i]) - gain_old[m] * h[i]) / decay[m]
+    return end, change / largest
 
 
 def modal_compliance(
     M: np.ndarray, D: np.ndarray, K: np.ndarray, column: int, dt: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Modes of ``[(s^2 M + s D + K)^{-1}]_{cc}``: poles, decay, gain_old, gain_new.
+) -> np.ndarray:
+    """Modes of ``[(s^2 M + s D + K)^{-1}]_{cc}``: poles, decay, gain_old, gain_new; (4, modes).
 
     Conjugate pairs are folded into one mode of twice the residue; a first-order hold over ``dt``.
     """
@@ -302,4 +288,4 @@ def modal_compliance(
     decay = np.exp(z)
     phi1 = np.expm1(z) / z
     phi2 = (phi1 - 1.0) / z
-    return poles, decay, residue * dt * (phi1 - phi2), residue * dt * phi2
+    return np.stack([poles, decay, residue * dt * (phi1 - phi2), residue * dt * phi2])

@@ -1,0 +1,72 @@
+"""Laws that move the arm by which they are moved: the periodic steady state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.hypotheses.kernels import LINK, loop_sweep, spring_torque
+from ident.mixing import MEMORY, mixed
+
+SWEEPS = 25  # periods at most until the steady state
+STEADY = 1e-5  # change of the torque from one to the next, over the largest, that ends them
+
+
+def steady_loop(
+    law: tuple[int, float, float, float], linear: np.ndarray, rate: np.ndarray, modes: np.ndarray, guess: np.ndarray | None = None
+) -> np.ndarray:
+    """Torque (S, T) of a law in steady state with the arm, N m.
+
+    ``x = linear - r * h(x, x')`` with ``r`` the compliance of the arm at the law, as a sum of modes stepped
+    with a first-order hold: ``x+ = decay x + gain_old h + gain_new h+``. The velocity is that of the modes
+    (residues add up to zero: a torque does not step a velocity). Records are stepped side by side, each until it
+    repeats; where a sweep begins is mixed from those before.
+
+    Args:
+        law: code, a, b, k (see ``kernels.loop_sweep``).
+        linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
+        modes: (4, modes) complex, of ``kernels.modal_compliance``.
+        guess: (modes, S) complex state from which to begin; rest where None.
+    """
+    code, a, b, k = law
+    S, T = linear.shape
+    poles, decay, _, _ = modes
+    whole = (decay**T)[:, None]
+    linear, rate = np.ascontiguousarray(linear.T), np.ascontiguousarray(rate.T)
+    start = np.zeros((len(decay), S), complex) if guess is None else guess
+    x = linear[-1] - start.real.sum(axis=0)
+    if code == LINK:
+        h = a * x + b * np.tanh((rate[-1] - (poles @ start).real) / k)
+    else:
+        h = np.array([spring_torque(code, a, b, k, v, v, 0.0) for v in x])
+    memory, left = np.stack([x, x, h]), np.arange(S)
+    out, part = np.zeros((T, S)), np.zeros((T, S))
+    past: list[tuple[np.ndarray, np.ndarray]] = []
+    for sweep in range(SWEEPS):
+        end, change = loop_sweep(*law, linear, rate, modes, start, memory, part)
+        # The state that the torque of this period repeats.
+        move = (end - whole * start) / (1.0 - whole) - start
+        moving = change > STEADY if sweep else np.ones(len(left), bool)
+        past = [*past[-MEMORY:], (start.T, move.T)]
+        if not np.all(moving):
+            out[:, left[~moving]] = part[:, ~moving]
+            left, part, memory = left[moving], part[:, moving], memory[:, moving]
+            linear, rate = linear[:, moving], rate[:, moving]
+            past = [(z[moving], f[moving]) for z, f in past]
+        if not len(left):
+            break
+        start = np.ascontiguousarray(mixed(past).T)
+    out[:, left] = part
+    return out.T.copy()
+
+
+def modal_state(torque: np.ndarray, omega: np.ndarray, step: float, modes: np.ndarray) -> np.ndarray:
+    """State (modes, S) of modes one step before the period that a periodic torque keeps repeating.
+
+    Args:
+        torque: (S, L) spectrum, N m; omega: (L,) rad/s, the first of them zero; step: s.
+    """
+    _, decay, gain_old, gain_new = (m[:, None] for m in modes)
+    z = np.exp(1j * omega * step)
+    ahead, behind = ((gain_old + gain_new * u) / (u - decay) / u for u in (z, z.conj()))
+    behind[:, 0] = 0.0
+    return ahead @ torque.T + behind @ torque.conj().T

@@ -1,0 +1,107 @@
+"""Laws in steady state with the arm that they move."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.hypotheses import kernels
+from ident.hypotheses.loop import modal_state, steady_loop
+
+PERIOD, POINTS = 2.0, 12000  # s, of the grid
+M, D, K = np.array([[1.0, 0.2], [0.2, 0.5]]), np.diag([1.5, 0.8]), np.array([[4e3, -5e2], [-5e2, 2e3]])
+LAWS = {
+    "cubic": (kernels.CUBIC, 4e8, 0.0, 4e3),
+    "softening": (kernels.SOFTENING, 2.5e3, 1e-3, 4e3),
+    "hysteresis": (kernels.HYSTERESIS, 1e3, 0.5, 4e3),
+    "cable": (kernels.LINK, 300.0, 0.8, 0.01),
+}
+MODES = kernels.modal_compliance(M, D, K, 0, PERIOD / POINTS)
+OMEGA = 2 * np.pi * np.arange(POINTS // 2 + 1) / PERIOD
+
+
+def spectrum(x):
+    return np.fft.rfft(x, axis=-1) / POINTS
+
+
+def in_time(X):
+    return np.fft.irfft(X * POINTS, POINTS, axis=-1)
+
+
+def compliance():
+    s = 1j * OMEGA[:, None, None]
+    return np.linalg.inv(s**2 * M + s * D + K)[:, 0, 0]
+
+
+def free_motion(records=3, lines=25, size=2e-3, seed=0):
+    rng = np.random.default_rng(seed)
+    X = np.zeros((records, len(OMEGA)), complex)
+    X[:, 1 : lines + 1] = rng.normal(size=(records, lines, 2)) @ [1.0, 1.0j]
+    x = in_time(X)
+    return spectrum(size * x / np.abs(x).max(axis=1, keepdims=True))
+
+
+def loop(law, X, guess=None):
+    return steady_loop(law, in_time(X), in_time(1j * OMEGA * X), MODES, guess)
+
+
+def law_along(law, x, v):
+    code, a, b, k = law
+    if code == kernels.LINK:
+        return a * x + b * np.tanh(v / k)
+    if code == kernels.CUBIC:
+        return a * x**3
+    if code == kernels.SOFTENING:
+        return (a - k) * np.clip(x, -b, b)
+    return kernels.elastoplastic(x, a, b)
+
+
+def test_a_linear_law_is_solved_as_linear_algebra_does():
+    X = free_motion()
+    expected = 300.0 * X / (1.0 + 300.0 * compliance())
+    found = spectrum(loop((kernels.LINK, 300.0, 0.0, 0.01), X))
+    assert found == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_torque_is_that_of_the_law_where_it_moves_the_arm(name):
+    X = free_motion()
+    h = loop(LAWS[name], X)
+    H = spectrum(h)
+    there = X - compliance() * H
+    expected = law_along(LAWS[name], in_time(there), in_time(1j * OMEGA * there))
+    assert np.std(h - expected) < 5e-3 * np.std(expected)
+    assert np.std(in_time(compliance() * H)) > 0.03 * np.std(in_time(X))  # the law does move the arm
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_where_a_loop_begins_does_not_matter(name):
+    X = free_motion()
+    cold = loop(LAWS[name], X)
+    near = modal_state(spectrum(1.1 * cold), OMEGA, PERIOD / POINTS, MODES)
+    assert loop(LAWS[name], X, near) == pytest.approx(cold, abs=2e-4 * np.abs(cold).max())
+
+
+def test_records_do_not_see_each_other():
+    X = free_motion(4)
+    together = loop(LAWS["cable"], X)
+    for i in range(4):
+        assert loop(LAWS["cable"], X[i : i + 1])[0] == pytest.approx(together[i], abs=1e-4)
+
+
+def test_modes_return_to_the_state_that_a_torque_repeats():
+    h = in_time(free_motion(2, lines=400, size=1.0))
+    _, decay, old, new = (m[:, None] for m in MODES)
+    start = z = modal_state(spectrum(h), OMEGA, PERIOD / POINTS, MODES)
+    for t in range(POINTS):
+        z = decay * z + old * h[:, t - 1] + new * h[:, t]
+    assert z == pytest.approx(start, abs=1e-9 * np.abs(start).max())
+
+
+@given(st.floats(0, 1e3), st.floats(0, 50), st.floats(1e-6, 1), st.floats(-1, 1), st.floats(-3, 3), st.floats(0, 1e-3), st.floats(0, 1.0))
+@settings(max_examples=300, deadline=None)
+def test_torque_of_a_cable_at_a_point(stiffness, friction, turn, q, v, dq, dv):
+    h = kernels.link_point(stiffness, friction, turn, q, v, dq, dv)
+    slope = 1.0 + stiffness * dq + friction * dv / turn  # of the equation in h, at most
+    miss = h - stiffness * (q - dq * h) - friction * np.tanh((v - dv * h) / turn)
+    assert abs(miss) <= 1e-7 * (abs(h) + friction) * slope
