@@ -30,7 +30,7 @@ from sim.effects import EFFECTS, parameters_of
 from sim.experiment import plan_experiment
 
 STRENGTH = 1.0
-START = {"smoothing_velocity": 1e-3, "inertia": 1e-3, "reaction": 1.0, "viscous": 1.0, "com_x": 0.0, "com_y": 0.0, "com_z": 0.0}
+START = {"smoothing_velocity": 1e-3, "inertia": 1e-3, "reaction": 1.0, "viscous": 1.0, "com_x": 0.0, "com_y": 0.0, "com_z": 0.0, "tilt_1": 0.0, "tilt_2": 0.0}
 
 
 def true_hypothesis(problem: Problem, effect) -> Effect:
@@ -43,7 +43,7 @@ def true_hypothesis(problem: Problem, effect) -> Effect:
         truth |= {"sine": truth["amplitude"] * np.cos(phase), "cosine": truth["amplitude"] * np.sin(phase)}
     fits = [h for h in catalogue(problem.structure) if (h.effect, h.place) == (effect.name, effect.place)]
     if "axis" in truth:
-        fits = [h for h in fits if tuple(h.options["axis"]) == tuple(truth["axis"])]
+        fits = [h for h in fits if tuple(h.options["axis"](np.zeros(len(h.parameters)))) == tuple(truth["axis"]) and not h.options["before"]]
     if not fits:
         raise LookupError("no hypothesis of the torque equation")
     values = [float(truth.get(p.name, START.get(p.name, 1.0))) for p in fits[0].parameters]

@@ -16,9 +16,10 @@ import numpy as np
 import scipy.stats
 
 from ident.extended import Effect, Model, along_record, as_loop, is_along_record
+from ident.graybox import Parameters
 from ident.hypotheses import Hypothesis, Parameter, catalogue
 from ident.parallel import Workers
-from ident.screening import Score, screen, signal_scale
+from ident.screening import Score, hinge_start, screen, signal_scale
 from ident.torque_fit import (
     ANNEALING,
     Fit,
@@ -35,6 +36,7 @@ DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
 RECORD_EXCESS = 1.6  # the same of a model along the record
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
+ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain beyond that
 FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched by linear steps alone
@@ -54,6 +56,8 @@ REFITS = 8  # candidates refitted in a round
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
 POLISH_STEPS = 40  # of the winner of a round
 PER_EFFECT = 2  # of one effect, at most
+NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
+MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place: share of the highest resonance tried, damping
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
@@ -116,25 +120,43 @@ def fit_baseline(
     """Baseline parameters of the gray-box, with the ``effects`` that every candidate has too.
 
     Where the fit leaves more than the noise it is started again with other dampers: they are
-    determined far worse than springs, and a damper that has once collapsed does not come back.
+    determined far worse than springs, and a damper that has once collapsed does not come back. Gears that have gone
+    astray, as one that is overdamped and hides its spring, begin again from their guesses.
     """
     start = Model(problem.structure, problem.nominal, effects)
     best = first = anneal(problem, start, progress=progress)
+    def again(par: Parameters) -> Fit:
+        """Fitted from other drives."""
+        return anneal(
+            problem,
+            replace(best.model, par=par),
+            ladder=ANNEALING[-2:],
+            iterations=8,
+            remainders=best.remainders,
+            progress=progress,
+        )
+
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
             damping = np.maximum(par.damping, problem.nominal.damping) * factor
-            again = replace(best.model, par=replace(par, damping=damping))
-            other = anneal(
-                problem,
-                again,
-                ladder=ANNEALING[-2:],
-                iterations=8,
-                remainders=best.remainders,
-                progress=progress,
-            )
-            best = min(best, other, key=lambda f: f.cost)
+            best = min(best, again(replace(par, damping=damping)), key=lambda f: f.cost)
+        lost = astray(problem, best)
+        if np.any(lost):
+            par, guess = best.model.par, problem.nominal
+            stiffness, damping = np.where(lost, [guess.stiffness, guess.damping], [par.stiffness, par.damping])
+            other = again(replace(par, stiffness=stiffness, damping=damping))
+            # Where they only go astray elsewhere they stand for what is missing.
+            if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
+                best = other
     return replace(best, softer=first.softer)
+
+
+def astray(problem: Problem, result: Fit) -> np.ndarray:
+    """(n,) whether a gear has ended far from its starting guess."""
+    par, guess = result.model.par, problem.nominal
+    far = [np.abs(np.log(a / b)) for a, b in ((par.stiffness, guess.stiffness), (par.damping, guess.damping))]
+    return (far[0] > np.log(IMPLAUSIBLE)) | (far[1] > np.log(ASTRAY))
 
 
 def discrepancy_p_value(result: Fit) -> float:
@@ -159,7 +181,10 @@ def attribute(
     """
     p_value = discrepancy_p_value(baseline)
     detected = p_value < DETECTION_LEVEL and baseline.chi2_per_dof > DETECTION_EXCESS
-    hypotheses = tuple(hypotheses if hypotheses is not None else catalogue(problem.structure))
+    if hypotheses is None:
+        # In motions alone offsets of the torque are found with the inertias of the links, as part of the baseline.
+        hypotheses = catalogue(problem.structure, offsets=not problem.motions_alone)
+    hypotheses = tuple(hypotheses)
     current, rounds, unknown, count = baseline, [], False, 0
     while detected and count < max_causes and not settled(current) and not workers.late:
         workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
@@ -479,9 +504,14 @@ def explore(
     def finished(result: Fit) -> Fit:
         return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
 
-    chosen = choose(scores)
-    fits = workers.map(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
-    found = hopeful([(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None])
+    def begun(chosen: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
+        fits = workers.map(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
+        return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
+
+    found = begun(choose(scores))
+    if rough and left_by(found) > ANSWERED * excess and not workers.late:
+        found += begun(hinges_everywhere(problem, stage, scores))
+    found = hopeful(found)
     if not (rough and left_by(found) < ANSWERED * excess):
         last = workers.map(finished, [r for _, r in found])
         found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
@@ -534,7 +564,11 @@ def refit(
 
 
 def choose(scores: Sequence[Score]) -> list[Score]:
-    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times."""
+    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
+
+    A linear step hardly tells where a hinge is: if one is worth a refit, so are those before and after other joints
+    that come near it.
+    """
     out: list[Score] = []
     top = scores[0].gain if scores else 0.0
     for score in scores:
@@ -544,7 +578,26 @@ def choose(scores: Sequence[Score]) -> list[Score]:
         out.append(score)
         if len(out) == REFITS:
             break
+    near: dict[tuple, Score] = {}
+    for s in scores:
+        if "hinge" in s.hypothesis.options and s.start is not None:
+            near.setdefault((s.hypothesis.key, s.hypothesis.options["before"]), s)
+    taken, best = {id(s) for s in out}, max((s.gain for s in near.values()), default=0.0)
+    if taken & {id(s) for s in near.values()}:
+        out += [s for s in near.values() if id(s) not in taken and s.gain >= NEAR_HINGE * best]
     return out
+
+
+def hinges_everywhere(problem: Problem, stage: Fit, scores: Sequence[Score]) -> list[Score]:
+    """A hinge at each place where there may be one, of a resonance within the band.
+
+    The gears have taken up the best part of one that is missing: a linear step from there has a wrong sign, or
+    answers at another joint.
+    """
+    scale = signal_scale(problem, predictions(problem, stage.model, stage.remainders), 0, ())
+    middle = MID_RESONANCE * scale.resonances[-1]
+    hinges = [s for s in scores if "hinge" in s.hypothesis.options]
+    return [replace(s, start=hinge_start(problem, s.hypothesis, middle, MID_RATIO)) for s in hinges]
 
 
 def beside_strong(
@@ -696,8 +749,11 @@ def occam(candidate: Candidate, temper: float) -> float:
 
 
 def pointless(effect: Effect) -> bool:
-    """Whether the parameters of an effect leave nothing of it that another one does not hold."""
-    return bool(effect.hypothesis.options.get("trivial", lambda p: False)(effect.p))
+    """Whether the parameters of an effect leave nothing of it that another one does not hold, or all lie at a bound."""
+    h = effect.hypothesis
+    sizes = [(q, v) for q, v in zip(h.parameters, effect.p, strict=True) if q.log and not q.nuisance]
+    at_bound = bool(sizes) and all(not q.lower * 1.01 < v < q.upper * 0.99 for q, v in sizes)
+    return at_bound or bool(h.options.get("trivial", lambda p: False)(effect.p))
 
 
 def _wave(parameters: Sequence[Parameter]) -> bool:

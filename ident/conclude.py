@@ -10,6 +10,7 @@ from ident.attribute import UNDETERMINED, Attribution, Candidate, pointless
 from ident.dataset import Dataset
 from ident.extended import Effect, Prediction, is_along_record
 from ident.graybox import INERTIAL, parameter_unit
+from ident.hypotheses import Hypothesis
 from ident.link_sensor import LinkDelay
 from ident.next_experiment import NextExperiment, advice
 from ident.quantization import Steps
@@ -27,6 +28,7 @@ from ident.trust import (
 )
 from ident.verdict import Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
+AXIS_STEP = 1e-6  # of a tilt
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 
 
@@ -236,9 +238,22 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
             "phase": Value(phase, sigma / max(amplitude, 1e-300), "rad"),
         }
     if h.effect in ("transverse_elasticity", "base_elasticity"):
-        axis = h.options["axis"]
-        out |= {f"axis_{n}": Value(float(a), 0.0, "1") for n, a in zip("xyz", axis, strict=True)}
+        axis = h.options["axis"](effect.p)
+        spread = axis_std(h, effect.p, np.array([std[q.name] for q in h.parameters]))
+        out |= {f"axis_{n}": Value(float(a), float(s), "1") for n, a, s in zip("xyz", axis, spread, strict=True)}
+        if h.options["before"]:
+            out["before"] = Value(1.0, 0.0, "1")
     return out
+
+
+def axis_std(h: Hypothesis, p: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """(3,) standard deviations of an elastic axis, to first order in those of its tilts."""
+    axis, out = h.options["axis"], np.zeros(3)
+    for i in range(2, len(p)):
+        moved = p.copy()
+        moved[i] += AXIS_STEP
+        out += ((axis(moved) - axis(p)) / AXIS_STEP * std[i]) ** 2
+    return np.sqrt(out)
 
 
 def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain | None) -> str:

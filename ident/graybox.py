@@ -13,6 +13,7 @@ couple joints. All drive figures are referred to the link side of the gear.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -213,15 +214,17 @@ def build_structure(
     parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
     changed = {parent[link]: change for link, change in (links or {}).items()}
     known = inertias or {}
-    carrier = {0: _add_hinges(model, 0, "base", hinges, pin.SE3.Identity())}
+    carrier = {0: _add_hinges(model, 0, [h for h in hinges if h.joint == "base"], pin.SE3.Identity())[0]}
     index: dict[str, int] = {}
     for i in range(1, source.njoints):
         name, joint = source.names[i], source.joints[i]
-        k = model.addJoint(
-            carrier[source.parents[i]], _joint_model(joint), source.jointPlacements[i], name
+        own = [h for h in hinges if h.joint == name]
+        below, placement = _add_hinges(
+            model, carrier[source.parents[i]], [h for h in own if h.before], source.jointPlacements[i]
         )
+        k = model.addJoint(below, _joint_model(joint), placement, name)
         index[name] = model.idx_vs[k]
-        carrier[i] = _add_hinges(model, k, name, hinges, pin.SE3.Identity())
+        carrier[i], _ = _add_hinges(model, k, [h for h in own if not h.before], pin.SE3.Identity())
         body = changed.get(i, LinkChange()).of(known.get(name, source.inertias[i]))
         model.appendBodyToJoint(carrier[i], body, pin.SE3.Identity())
     bodies = {
@@ -517,11 +520,12 @@ def _hinge_name(hinge: Elasticity) -> str:
 
 
 def _add_hinges(
-    model: pin.Model, parent: int, joint: str, hinges: tuple[Elasticity, ...], placement: pin.SE3
-) -> int:
+    model: pin.Model, parent: int, hinges: Sequence[Elasticity], placement: pin.SE3
+) -> tuple[int, pin.SE3]:
+    """The last of a chain of hinges, and where it takes what comes after them."""
     for hinge in hinges:
-        if hinge.joint == joint:
-            axis = np.asarray(hinge.axis, float)
-            revolute = pin.JointModelRevoluteUnaligned(axis / np.linalg.norm(axis))
-            parent = model.addJoint(parent, revolute, placement, _hinge_name(hinge))
-    return parent
+        axis = np.asarray(hinge.axis, float)
+        revolute = pin.JointModelRevoluteUnaligned(axis / np.linalg.norm(axis))
+        parent = model.addJoint(parent, revolute, placement, _hinge_name(hinge))
+        placement = pin.SE3.Identity()
+    return parent, placement

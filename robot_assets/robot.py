@@ -46,10 +46,10 @@ class Joint:
 
 @dataclass(frozen=True)
 class Elasticity:
-    """A spring-damper hinge that no motor turns, right after joint ``joint`` ("base": below all).
+    """A spring-damper hinge that no motor turns, right after joint ``joint`` ("base": below all), or right before it.
 
     Attributes:
-        axis: in the frame of that joint, after its rotation.
+        axis: in the frame of that joint, after its rotation; before it where the hinge is.
         stiffness: N m/rad. damping: N m s/rad.
     """
 
@@ -58,6 +58,7 @@ class Elasticity:
     axis: tuple[float, float, float]
     stiffness: float
     damping: float
+    before: bool = False
 
 
 @dataclass(frozen=True)

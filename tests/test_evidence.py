@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, weigh
+from ident.attribute import ABSENT, POINTLESS_NATS, TEMPER, Candidate, astray, explained, occam, pointless, weigh
 from ident.diagnose import diagnose
+from ident.extended import Effect
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.reporting import frf_views
@@ -162,3 +163,32 @@ def test_a_motor_that_friction_holds_is_no_drive_that_saturates(tmp_path):
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
     assert all(c.probability < 0.5 for c in verdict.causes if c.effect != "coulomb_friction")
+
+
+def test_an_offset_of_a_torque_record_is_no_spring(clean, tmp_path):
+    """A spring whose rest is far away pulls with a constant torque."""
+    data, _ = clean
+    offset = np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    segments = tuple(replace(s, tau=s.tau + offset) for s in data.segments)
+    verdict = diagnose(through_files(replace(data, segments=segments), tmp_path), max_seconds=120)
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    assert all(c.probability < 0.5 for c in verdict.causes)
+
+
+def test_an_effect_at_its_bounds_is_none(named):
+    backlash = named["backlash", "elbow_joint"]
+    gap = backlash.parameters[0]
+    assert pointless(Effect(backlash, np.array([gap.lower])))
+    assert not pointless(Effect(backlash, np.array([1e-4])))
+    spring = named["gravity_spring", "elbow_joint"]
+    assert pointless(Effect(spring, np.array([0.1, -9.9])))
+    assert not pointless(Effect(spring, np.array([300.0, 1.0])))
+
+
+def test_a_gear_far_from_its_guess_has_gone_astray(identified):
+    setup, fit = identified[:2]
+    assert not np.any(astray(setup.problem, fit))
+    par = fit.model.par
+    far = replace(par, damping=par.damping * np.array([1, 1, 1, 100, 1, 1]))
+    moved = replace(fit, model=replace(fit.model, par=far))
+    assert list(np.flatnonzero(astray(setup.problem, moved))) == [3]

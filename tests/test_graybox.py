@@ -83,3 +83,27 @@ def test_a_stiff_hinge_changes_nothing_and_a_soft_one_adds_a_resonance(ur10):
     rigid = sampled_frf(structure, par, linearise(structure, equilibrium(structure, par, Q0)), f, 1e-3, "zoh")[0]
     assert np.abs(response(1e11) - rigid).max() < 1e-4 * np.abs(rigid).max()
     assert np.abs(response(2e4) - rigid).max() > 0.05 * np.abs(rigid).max()
+
+
+def test_a_hinge_before_a_joint_turns_with_its_carrier(ur10):
+    """About the joint's own axis it is the joint again; about another it does not turn with the joint, one after it does."""
+    def hinge(axis, before):
+        return Elasticity("h", "elbow_joint", axis, 1e4, 10.0, before)
+
+    def inertia(axis, before, elbow):
+        structure = build_structure(ur10, elasticities=(hinge(axis, before),))
+        q = np.zeros(structure.n_coordinates)
+        q[structure.driven] = [0.1, -1.0, elbow, 0.3, 0.2, 0.1]
+        M = linearise(structure, q).M
+        return M, structure.elastic[0], structure.driven[2]
+
+    own = (0.0, 1.0, 0.0)
+    for before in (False, True):
+        M, h, j = inertia(own, before, 0.7)
+        assert M[h] @ M[h] == pytest.approx(M[j] @ M[j], rel=1e-9)
+        assert M[h, h] == pytest.approx(M[j, j], rel=1e-12)
+    # The wrist alone turns about the elbow's x axis through its own offset; seen from the upper arm that axis stands still.
+    after, before = ([inertia((1.0, 0.0, 0.0), side, elbow) for elbow in (0.2, 1.2)] for side in (False, True))
+    a, b = ([M[h, h] for M, h, _ in runs] for runs in (after, before))
+    assert a[0] == pytest.approx(a[1], rel=1e-9)
+    assert abs(b[0] / b[1] - 1) > 0.1

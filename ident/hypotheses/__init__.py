@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ident.graybox import Structure
 from ident.hypotheses import drive, friction, sensing, structure, transmission
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
@@ -30,11 +32,14 @@ PER_JOINT = (
 )
 
 
-def catalogue(chain: Structure) -> tuple[Hypothesis, ...]:
+def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ...]:
     """Every hypothesis at every place of an arm, decoys included.
 
     Decoys describe what the catalogue lacks: one that explains the data better than every named
     effect says that the cause is unknown.
+
+    Args:
+        offsets: whether constant errors of the recorded torque are among them.
     """
     robot = chain.robot
     names = robot.joint_names
@@ -43,6 +48,8 @@ def catalogue(chain: Structure) -> tuple[Hypothesis, ...]:
         out += [make(j, name) for make in PER_JOINT]
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.position_friction(j, name))
+        if offsets:
+            out.append(sensing.constant_torque(j, name))
         if robot.joints[j].gear_ratio != 1.0:
             out.append(sensing.encoder_eccentricity(j, name, robot.joints[j].gear_ratio))
     for j in range(len(names) - 1):
@@ -57,10 +64,17 @@ def catalogue(chain: Structure) -> tuple[Hypothesis, ...]:
         carries = index == chain.bodies.get(robot.payload_link, (0, None))[0]
         out.append(structure.link_inertia(link, _joint_of_body(chain, index), carries))
     for j, name in enumerate(names):
-        out += [structure.compliance(name, j, axis, "transverse_elasticity") for axis in _across(chain, j)]
-    for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
-        out.append(structure.compliance("base", -1, axis, "base_elasticity"))
+        # Before the first joint it would be the base that moves.
+        for before in (False, True)[: 1 + (j > 0)]:
+            out += [structure.compliance(name, j, axes, "transverse_elasticity", before) for axes in _turned(_across(chain, j))]
+    out += [structure.compliance("base", -1, axes, "base_elasticity") for axes in _turned(np.eye(3))]
     return tuple(out)
+
+
+def _turned(axes: np.ndarray) -> list[tuple[tuple[float, float, float], ...]]:
+    """Each of the axes first, the others behind it."""
+    rows = [tuple(float(v) for v in a) for a in axes]
+    return [tuple(rows[i:] + rows[:i]) for i in range(len(rows))]
 
 
 def _joint_of_body(chain: Structure, index: int) -> int:
@@ -71,14 +85,13 @@ def _joint_of_body(chain: Structure, index: int) -> int:
     return below[-1] if below else -1
 
 
-def _across(chain: Structure, joint: int) -> list[tuple[float, float, float]]:
-    """Two axes of the joint's frame that are not its own."""
-    import numpy as np
-
+def _across(chain: Structure, joint: int) -> np.ndarray:
+    """(2, 3) axes of the joint's frame, across its own."""
     index = next(i for i in range(1, chain.model.njoints) if chain.model.idx_vs[i] == chain.driven[joint])
     own = np.asarray(chain.model.joints[index].extract().axis)
-    axes = sorted(np.eye(3), key=lambda a: abs(a @ own))[:2]
-    return [tuple(float(v) for v in a) for a in axes]
+    axes = np.stack(sorted(np.eye(3), key=lambda a: abs(a @ own))[:2])
+    axes = axes - np.outer(axes @ own, own) / (own @ own)
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
 __all__ = ["Hypothesis", "Parameter", "Screen", "SignalScale", "catalogue"]

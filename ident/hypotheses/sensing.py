@@ -90,21 +90,36 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
     )
 
 
+def constant_torque(joint: int, place: str) -> Hypothesis:
+    """Decoy: a constant error of the recorded torque, which the catalogue lacks and a spring with a far rest would take."""
+    return Hypothesis(
+        "unknown:constant_torque",
+        place,
+        joint,
+        "motor",
+        (Parameter("offset", "N m", -1e7, 1e7),),
+        _constant,
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen((np.ones_like(motion.q(j)),), lambda c: np.array([c[0]]), ()),
+        "The recorded torque of {joint} is off by a constant.",
+    )
+
+
 def torque_offset(joint: int, place: str) -> Hypothesis:
     """A constant error of the recorded torque: no effect of the catalogue, but of every torque sensor."""
-
-    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        return p[0] * np.ones_like(motion.q(j))
-
     return Hypothesis(
         "torque_offset",
         place,
         joint,
         "motor",
         (Parameter("offset", "N m", -1e7, 1e7),),
-        law,
+        _constant,
         lambda scale: [()],
         None,
         "The recorded torque of {joint} is off by {offset:.3g} N m.",
         options={"baseline": True},
     )
+
+
+def _constant(p: np.ndarray, motion: Motion, j: int, k: float) -> np.ndarray:
+    return p[0] * np.ones_like(motion.q(j))

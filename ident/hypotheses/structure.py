@@ -37,6 +37,9 @@ from robot_assets.robot import Elasticity
 
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
 SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
+STIFFEST = 1e12  # N m/rad, of a hinge
+FARTHEST_REST = 10.0  # of a balancing spring, rad or m
+MOST_TILT = 3.0  # of an elastic axis towards each other axis, in units of that along the one from which it is sought
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
 
 
@@ -102,13 +105,14 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
         place,
         joint,
         "link",
-        (Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True), Parameter("rest_angle", "rad", -10.0, 10.0, step=1e-3)),
+        (Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True), Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, step=1e-3)),
         lambda p, motion, j, k: p[0] * (motion.q_link(j) - p[1]),
         lambda scale: [()],
         screen,
         "A spring of {stiffness:.3g} N m/rad with rest at {rest_angle:.3g} rad pulls on the link of {joint}: static"
         " torque that is linear in posture.",
         variable="q",
+        options={"trivial": lambda p: abs(p[1]) > 0.95 * FARTHEST_REST},  # a constant torque
     )
 
 
@@ -273,51 +277,70 @@ def joint_coupling(source: int, target: int, place: str) -> Hypothesis:
     )
 
 
-def compliance(place: str, joint_index: int, axis: tuple[float, float, float], effect: str) -> Hypothesis:
-    """A spring-damper hinge across a joint (or under the base) that the model lacks."""
-    name = f"{effect}:{place}"
+def compliance(
+    place: str, joint_index: int, axes: tuple[tuple[float, float, float], ...], effect: str, before: bool = False
+) -> Hypothesis:
+    """A spring-damper hinge across a joint (or under the base) that the model lacks.
 
-    def hinge(stiffness: float, damping: float) -> Elasticity:
-        return Elasticity(name, place, axis, float(stiffness), float(damping))
+    Args:
+        axes: the one from which the axis is sought, and those towards which it may turn.
+        before: hinge before the joint, at the end of the body that carries it.
+    """
+    name = f"{effect}:{place}"
+    tilts = tuple(f"tilt_{i}" for i in range(1, len(axes)))
+
+    def axis(p: Sequence[float]) -> np.ndarray:
+        direction = np.array(axes[0]) + np.asarray(p)[2:] @ np.array(axes[1:])
+        return direction / np.linalg.norm(direction)
+
+    def hinge(p: Sequence[float]) -> Elasticity:
+        x, y, z = (float(v) for v in axis(p))
+        return Elasticity(name, place, (x, y, z), float(p[0]), float(p[1]), before)
 
     def responses(structure, par, plane, group, solution, shape):
         frequency, ratio = shape
-        own = hinge_inertia(structure, hinge(1e12, 1.0), group, plane)
+        straight = np.zeros(len(tilts))
+        own = hinge_inertia(structure, hinge([1e12, 1.0, *straight]), group)
         stiffness = own * (2 * np.pi * frequency) ** 2
         damping = 2 * ratio * np.sqrt(own * stiffness)
-        wide, wide_par = apply_change(structure, par, Change(elasticities=(hinge(stiffness, damping),)))
+        wide, wide_par = apply_change(structure, par, Change(elasticities=(hinge([stiffness, damping, *straight]),)))
         lin = linearise(wide, equilibrium(wide, wide_par, group.posture))
         Z, _, _ = impedance(wide, wide_par, lin, plane.s)
         unit = np.matmul(Z - plane.Z, solution.Q[..., None])[..., 0]
         unit[:, 0] = 0.0
         return [plane.record[:, None] * unit]
 
+    where = "before its own turn" if before else "after its own turn"
     return Hypothesis(
         effect,
         place,
         joint_index,
         "model",
         (
-            Parameter("stiffness", "N m/rad", 1.0, 1e12, log=True, step=1e-3),
+            Parameter("stiffness", "N m/rad", 1.0, STIFFEST, log=True, step=1e-3),
             Parameter("damping", "N m s/rad", 1e-6, 1e9, log=True, step=1e-2),
+            *(Parameter(t, "1", -MOST_TILT, MOST_TILT, nuisance=True, step=1e-3, spread=1.0, null=0.0) for t in tilts),
         ),
         None,
         lambda scale: [(f, 0.03) for f in scale.resonances],
         None,
-        "The data hold a resonance that the model lacks: {joint} bends across its axis with {stiffness:.3g} N m/rad."
+        f"The data hold a resonance that the model lacks: {{joint}} bends across its axis, {where}, with"
+        " {stiffness:.3g} N m/rad."
         if effect == "transverse_elasticity"
         else "A resonance common to all axes: the foundation moves on {stiffness:.3g} N m/rad.",
         variable="frequency",
         options={
-            "change": lambda p: Change(elasticities=(hinge(p[0], p[1]),)),
+            "change": lambda p: Change(elasticities=(hinge(p),)),
             "responses": responses,
             "hinge": hinge,
             "axis": axis,
+            "before": before,
+            "trivial": lambda p: p[0] > 0.1 * STIFFEST,
         },
     )
 
 
-def hinge_inertia(structure: Structure, hinge: Elasticity, group: Group, plane: Plane) -> float:
+def hinge_inertia(structure: Structure, hinge: Elasticity, group: Group) -> float:
     """Inertia about a new hinge with everything else held, kg m2."""
     wide = build_structure(structure.robot, elasticities=(hinge,), inertias=structure.inertias)
     q = np.zeros(wide.n_coordinates)

@@ -125,7 +125,8 @@ def build_mjcf(
 def _hidden_hinge(index: int, cause: Cause) -> Elasticity:
     p = {k: v.value for k, v in cause.parameters.items()}
     axis = (p["axis_x"], p["axis_y"], p["axis_z"])
-    return Elasticity(f"{cause.effect}:{cause.joint}:{index}", cause.joint, axis, p["stiffness"], p["damping"])
+    name = f"{cause.effect}:{cause.joint}:{index}"
+    return Elasticity(name, cause.joint, axis, p["stiffness"], p["damping"], before="before" in p)
 
 
 def _payload(robot: Robot, cause: Cause) -> tuple[str, pin.Inertia]:
