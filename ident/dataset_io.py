@@ -25,6 +25,7 @@ KINDS = ("multisine", "trajectory")
 ROLES = ("identification", "validation")
 HOLDS = ("zoh", "none")
 MAX_SEGMENTS = 100_000
+LONGEST_NAME = 240  # bytes of the name of a file
 
 
 def load_dataset(path: str | Path) -> Dataset:
@@ -99,6 +100,8 @@ def save_dataset(dataset: Dataset, path: str | Path) -> None:
     foreign = [p.name for p in target.iterdir() if not _of_dataset(p)] if target.is_dir() else []
     if foreign:
         raise DataError("output", str(path), f"{min(foreign)}, which is no part of a dataset", "a new folder or a dataset")
+    for segment in dataset.segments:
+        check_segment_name(segment.name, str(path))
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     try:
@@ -121,6 +124,13 @@ def save_dataset(dataset: Dataset, path: str | Path) -> None:
     finally:
         if beside.exists():
             shutil.rmtree(beside)
+
+
+def check_segment_name(name: str, where: str) -> None:
+    """Raise a DataError where a segment could not be a file of its name inside a folder."""
+    file = f"{name}.parquet"
+    if not name.isprintable() or "/" in name or "\\" in name or len(file.encode(errors="replace")) > LONGEST_NAME:
+        raise DataError("name of a segment", where, ascii(name), f"printable, without slashes, at most {LONGEST_NAME - 8} bytes")
 
 
 def _of_dataset(path: Path) -> bool:
