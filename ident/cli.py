@@ -362,7 +362,9 @@ def _guess(files: list[Path], robot: str, out: Path, json_: bool) -> None:
     guessed = guess_map(files, robot)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(guessed.text, encoding="utf-8")
+        beside = out.with_name(f".{out.name}.part")
+        beside.write_text(guessed.text, encoding="utf-8")
+        beside.replace(out)
     except OSError as err:
         raise DataError("--map", str(out), str(err.strerror or err), "a file that can be written") from err
     rows = [f"first map in {out}; check it, above all the lines marked EDIT"]
