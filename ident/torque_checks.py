@@ -7,6 +7,7 @@ ten per cent and drives by a factor of two, so only what is far outside is said.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from ident.channel_checks import anti_resonance
 from ident.dataset import Dataset, Segment
 from ident.graybox import build_structure
 
+SEGMENTS = 6  # of a dataset, that a diagnosis looks at
 BAND = 12.0  # Hz, at most: below, links follow their motors
 BELOW = 0.5  # of the lowest anti-resonance
 SETTLED = 0.3  # s: the filter of the band has forgotten the ends of the log
@@ -78,32 +80,49 @@ def match_torques(s: Segment, dataset: Dataset) -> Match | None:
     return Match(C, slope, size)
 
 
+def mislabelled(dataset: Dataset) -> list[str]:
+    """What is surely wrong in the labels of torques: said of more than half of the segments that were looked at."""
+    pick = np.unique(np.linspace(0, len(dataset.segments) - 1, SEGMENTS).round().astype(int))
+    found = [m for k in pick if (m := match_torques(dataset.segments[k], dataset)) is not None]
+    said = [contradictions(m, dataset.joints) for m in found]
+    kinds = Counter(key for one in said for key in one)
+    first = {key: text for one in reversed(said) for key, text in one.items()}
+    return [first[key] for key in sorted(kinds) if kinds[key] > len(found) / 2]
+
+
 def torque_warnings(s: Segment, dataset: Dataset) -> list[str]:
     """Signs, sizes and order of torques that the motion cannot have asked for."""
     found = match_torques(s, dataset)
     if found is None:
         return []
+    return list(contradictions(found, dataset.joints).values()) or _doubts(found)
+
+
+def contradictions(found: Match, joints: tuple[str, ...]) -> dict[tuple[int, str], str]:
+    """(Joint, kind) -> what no error of a model explains: swapped columns, a wrong sign, another size."""
     C, slope, own = found.correlation, found.slope, np.diag(found.correlation)
-    named = [f"tau_{j + 1} ({name})" for j, name in enumerate(dataset.joints)]
-    out, said = [], set()
-    for i in range(dataset.n):
+    named = [f"tau_{j + 1} ({name})" for j, name in enumerate(joints)]
+    out: dict[tuple[int, str], str] = {}
+    said: set[int] = set()
+    for i in range(len(joints)):
         for k in range(i):
             crossed = min(C[i, k], C[k, i]) > ALIKE and all(1 - c**2 < BETTER * (1 - o**2) for c, o in ((C[i, k], own[i]), (C[k, i], own[k])))
             if crossed and not said & {i, k}:
                 said |= {i, k}
-                out.append(f"{named[k]} follows what joint {i + 1} needs and tau_{i + 1} what joint {k + 1} needs: columns swapped?")
-    for j in range(dataset.n):
+                out[k, "swapped"] = f"{named[k]} follows what joint {i + 1} needs and tau_{i + 1} what joint {k + 1} needs: columns swapped?"
+    for j in range(len(joints)):
         if j in said or abs(own[j]) < ALIKE:
             continue
         if own[j] < 0:
-            out.append(f"{named[j]} runs against what bodies and motor need, {slope[j]:.3g} times it: wrong sign?")
+            out[j, "sign"] = f"{named[j]} runs against what bodies and motor need, {slope[j]:.3g} times it: wrong sign?"
         elif not 1 / FAR < slope[j] < FAR:
-            out.append(f"{named[j]} is {slope[j]:.3g} times what bodies and motor need: wrong unit, torque constant or side of the gear?")
-        else:
-            continue
-        said.add(j)
-    if out:
-        return out
+            out[j, "size"] = f"{named[j]} is {slope[j]:.3g} times what bodies and motor need: wrong unit, torque constant or side of the gear?"
+    return out
+
+
+def _doubts(found: Match) -> list[str]:
+    """What speaks against the labels, and may be an error of the model or poor data as well."""
+    out, slope, own = [], found.slope, np.diag(found.correlation)
     sure = slope[own > ALIKE]
     if len(sure) >= 3 and not 1 / ALL < np.median(sure) < ALL:
         out.append(f"torques are about {np.median(sure):.2g} times what bodies and motors need: wrong unit, or sample rate?")

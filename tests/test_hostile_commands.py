@@ -18,7 +18,7 @@ from tests.hostile.case import ACCEPTED, REFUSED, Case
 
 SECONDS = 10.0  # a command may take, with a machine that is busy
 MEMORY = 2**30  # bytes that a process may hold
-EVERY = 25  # one of so many cases is in the default suite
+EVERY = 60  # one of so many cases is in the default suite
 ROOT = Path(__file__).parent.parent
 CASES = [*logs.cases(), *maps.cases(), *robots.cases(), *datasets.cases()]
 

@@ -19,7 +19,7 @@ from robot_assets.errors import DataError
 from robot_assets.from_urdf import write_robot
 from tests.hostile import datasets, maps, sound
 
-EXAMPLES = settings(max_examples=60, deadline=None, derandomize=True)
+EXAMPLES = settings(max_examples=30, deadline=None, derandomize=True)
 values = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats() | st.text(max_size=20),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(min_size=1, max_size=8), inner, max_size=3),
@@ -74,7 +74,7 @@ def convert(folder: Path, log: Path, map_text: str) -> None:
 
 @pytest.mark.parametrize("suffix", [*sound.TABLES, *sound.BAGS])
 @given(cuts=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=40)), min_size=1, max_size=4))
-@settings(EXAMPLES, max_examples=25)
+@settings(EXAMPLES, max_examples=10)
 def test_a_damaged_log_is_read_or_refused(suffix, cuts):
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

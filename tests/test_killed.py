@@ -84,7 +84,7 @@ while True:
 def test_whatever_the_moment_the_files_are_of_one_run(tmp_path):
     out, rng = tmp_path / "out", np.random.default_rng(0)
     seen = set()
-    for _ in range(12):
+    for _ in range(6):
         process = subprocess.Popen([sys.executable, "-c", SWAP, str(out)], env=os.environ | {"PYTHONPATH": str(ROOT)})
         while not out.exists() and process.poll() is None:
             time.sleep(0.01)
