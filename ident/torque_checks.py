@@ -133,6 +133,6 @@ def _doubts(found: Match) -> list[str]:
         joints = ", ".join(str(j + 1) for j in np.flatnonzero(strange))
         out.append(
             f"the torque of joints {joints} has little to do with what their motion needs (correlation {own[strange].min():.2g}):"
-            " joints in another order, a wrong sign or zero of a position, noise, or another robot?"
+            " joints in another order, a wrong sign or zero of a position, strong friction, noise, or another robot?"
         )
     return out
