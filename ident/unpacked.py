@@ -15,7 +15,7 @@ from robot_assets.errors import DataError
 
 FREE = 2**28  # bytes that every log may take
 PACKED = 100  # times the size of the file, that a longer one may take
-PIECE = 2**20  # bytes unpacked at a time to count them
+PIECE, FED = 2**20, 2**16  # bytes unpacked at a time to count them, and given at a time: what is left of these is copied
 TAG, COMPRESSED = 8, 15  # bytes of the tag of an element; type of one that is packed (MAT-File Format, 1-9)
 CELLS = (1, 2, 3)  # classes of arrays of arrays: cells, structures, objects (1-16)
 
@@ -64,12 +64,11 @@ def _cells(array: bytes, order: str) -> int:
 def _inflated(data: bytes) -> Iterator[bytes]:
     """The pieces that packed data unpack to."""
     unpack = zlib.decompressobj()
-    while data and not unpack.eof:
-        piece = unpack.decompress(data, PIECE)
-        data = unpack.unconsumed_tail
-        yield piece
-        if not piece:
-            return
+    for start in range(0, len(data), FED):
+        given = data[start : start + FED]
+        while given and not unpack.eof:
+            yield unpack.decompress(given, PIECE)
+            given = unpack.unconsumed_tail
 
 
 def check_mcap(path: Path) -> None:
