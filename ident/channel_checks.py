@@ -29,6 +29,8 @@ BLOCKS = 8  # stretches of time, of which the jackknife leaves one out
 LONGEST = 2000  # instants that an estimate of skew looks at
 RANK = 1e-6  # of the largest singular value, below which columns tell the same
 EXPLAINED = 0.9  # share of the torque that must be explained for its skew to mean anything
+MOVES = 3.0  # standard deviation of a position over its noise
+LOW_SHARE = 0.1  # of the sample rate
 MOVING = 0.1  # of the largest speed: slower samples are left out, where friction is of another kind
 
 
@@ -305,6 +307,11 @@ def excitation_warnings(s: Segment, dataset: Dataset) -> list[str]:
     if len(smooth):
         out.append(f"no noise is left on the torque of joints {_list(smooth)}: the log was filtered, deviations will come out too small")
     if s.kind != "trajectory":
+        # Differences of samples show noise alone where the excitation stays far below the sample rate.
+        low = s.period is not None and not np.any(np.asarray(s.excited_lines) > LOW_SHARE * s.period)
+        still = np.flatnonzero(s.q.std(axis=0) < MOVES * difference_noise(s.q)) if low else np.zeros(0, int)
+        if len(still):
+            out.append(f"joints {_list(still)} hardly move beyond the noise of their position: nothing is learnt of them")
         return out
     v = velocity(s, rate)
     speeds = robot.array("velocity_limit")

@@ -92,9 +92,9 @@ def experiment(
     robot: str,
     out: Out,
     effect: Annotated[list[str] | None, typer.Option("--effect", help="NAME@PLACE:key=value,...; several hide several.")] = None,
-    seed: Annotated[int, typer.Option(help="Of excitation, noise and drives.")] = 0,
-    realizations: Annotated[int, typer.Option(min=1)] = 1,
-    points: Annotated[int, typer.Option(min=1, help="Operating points for identification.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Of excitation, noise and drives.")] = 0,
+    realizations: Annotated[int, typer.Option(min=1, max=1000)] = 1,
+    points: Annotated[int, typer.Option(min=1, max=1000, help="Operating points for identification.")] = 2,
     drives: Annotated[str, typer.Option(help='"nominal", or "drawn" within a factor of two.')] = "nominal",
     plan: Annotated[Path | None, typer.Option(help="A plan written by `simgap design`, or next_plan.toml of a diagnosis.")] = None,
     one_recording: Annotated[
@@ -189,12 +189,12 @@ def identify(
 def design(
     robot: str,
     out: Annotated[Path, typer.Option("--out", help="The plan, for `simgap experiment --plan`.")],
-    points: Annotated[int, typer.Option(min=1, help="Operating points for identification.")] = 15,
-    candidates: Annotated[int, typer.Option(min=1, help="Postures to choose from.")] = 8000,
+    points: Annotated[int, typer.Option(min=1, max=1000, help="Operating points for identification.")] = 15,
+    candidates: Annotated[int, typer.Option(min=1, max=1_000_000, help="Postures to choose from.")] = 8000,
     criterion: Annotated[str, typer.Option(help="D, A or E.")] = "D",
-    draws: Annotated[int, typer.Option(min=1, help="Of the parameters from a prior; 1: the nominal ones.")] = 1,
+    draws: Annotated[int, typer.Option(min=1, max=1000, help="Of the parameters from a prior; 1: the nominal ones.")] = 1,
     level: Annotated[list[float] | None, typer.Option(help="Excitation level; several, largest first.")] = None,
-    realizations: Annotated[int, typer.Option(min=1)] = 1,
+    realizations: Annotated[int, typer.Option(min=1, max=1000)] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of candidates and excitation.")] = 0,
     json_: Json = False,
     quiet: Quiet = False,
@@ -239,7 +239,7 @@ def diagnose(
 @app.command()
 def demo(
     out: Out,
-    seed: Annotated[int | None, typer.Option(help="Of the hidden effect and everything else; drawn where absent.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the hidden effect and everything else; drawn where absent.")] = None,
     real: Annotated[str | None, typer.Option(help="Diagnose shipped real data instead, by name.")] = None,
     json_: Json = False,
     quiet: Quiet = False,
@@ -362,7 +362,9 @@ def _guess(files: list[Path], robot: str, out: Path, json_: bool) -> None:
     guessed = guess_map(files, robot)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(guessed.text, encoding="utf-8")
+        beside = out.with_name(f".{out.name}.part")
+        beside.write_text(guessed.text, encoding="utf-8")
+        beside.replace(out)
     except OSError as err:
         raise DataError("--map", str(out), str(err.strerror or err), "a file that can be written") from err
     rows = [f"first map in {out}; check it, above all the lines marked EDIT"]
@@ -376,9 +378,10 @@ def show(folder: Path) -> None:
     """Open the recording of a diagnosis in the rerun viewer."""
     import subprocess
 
+    from ident.show.recording import check_recording
+
     recording = folder / "recording.rrd"
-    if not recording.is_file():
-        raise DataError("recording", str(folder), "no recording.rrd", "the folder of `simgap diagnose`")
+    check_recording(recording)
     raise typer.Exit(subprocess.call([sys.executable, "-m", "rerun", str(recording)]))
 
 

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import tomlkit
 
 from ident.dataset import Dataset, Segment
+from ident.outputs import take_place
 from ident.segment_file import CHANNELS, read_segment
 from robot_assets.errors import DataError
 from robot_assets.robot import ASSETS, Robot, load_robot
@@ -25,6 +26,7 @@ KINDS = ("multisine", "trajectory")
 ROLES = ("identification", "validation")
 HOLDS = ("zoh", "none")
 MAX_SEGMENTS = 100_000
+LONGEST_NAME = 240  # bytes of the name of a file
 
 
 def load_dataset(path: str | Path) -> Dataset:
@@ -93,34 +95,30 @@ def save_dataset(dataset: Dataset, path: str | Path) -> None:
     Raises:
         DataError: where the target exists and holds anything that is no part of a dataset.
     """
-    target = Path(path).absolute()
+    target = Path(path).resolve()
     if target.exists() and not target.is_dir():
         raise DataError("output", str(path), "a file", "a new folder or a dataset")
     foreign = [p.name for p in target.iterdir() if not _of_dataset(p)] if target.is_dir() else []
     if foreign:
         raise DataError("output", str(path), f"{min(foreign)}, which is no part of a dataset", "a new folder or a dataset")
+    for segment in dataset.segments:
+        check_segment_name(segment.name, str(path))
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     try:
         for segment in dataset.segments:
             pq.write_table(_table(segment), beside / f"{segment.name}.parquet", compression="zstd")
         (beside / "dataset.toml").write_text(tomlkit.dumps(_head(dataset, target)), encoding="utf-8")
-        os.chmod(beside, 0o755)
-        if target.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-            target.rename(old / "d")
-            try:
-                beside.rename(target)
-            except OSError:
-                (old / "d").rename(target)
-                raise
-            finally:
-                shutil.rmtree(old, ignore_errors=True)
-        else:
-            beside.rename(target)
+        take_place(beside, target)
     finally:
-        if beside.exists():
-            shutil.rmtree(beside)
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def check_segment_name(name: str, where: str) -> None:
+    """Raise a DataError where a segment could not be a file of its name inside a folder."""
+    file = f"{name}.parquet"
+    if not name.isprintable() or "/" in name or "\\" in name or len(file.encode(errors="replace")) > LONGEST_NAME:
+        raise DataError("name of a segment", where, ascii(name), f"printable, without slashes, at most {LONGEST_NAME - 8} bytes")
 
 
 def _of_dataset(path: Path) -> bool:

@@ -29,6 +29,9 @@ def write_design(
     """
     if out.is_dir():
         raise DataError("--out", str(out), "a folder", "a file for the plan")
+    for level in levels:
+        if not 1e-9 <= level <= 1e9:
+            raise DataError("--level", "command line", f"{level:g}", "an excitation level above zero")
     say("drawing postures and computing what each would show")
     last = [0]
 

@@ -32,8 +32,9 @@ from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, fit_rigid
+from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, Problem, data_count, fit, predictions
-from ident.trust import LEFT_ERROR
+from ident.trust import LEFT_ERROR, known_probability
 from ident.verdict import Diagnosis, Gain, Verdict
 from robot_assets.errors import DataError
 
@@ -46,6 +47,7 @@ MOVES = 3.0  # standard deviation of a position over its noise
 HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
 LEAST_HELD_OUT = 2.0  # s of it
 MAX_SECONDS = 900.0  # of search for causes
+UNKNOWN = "unknown cause remains"
 SEED = 0
 
 
@@ -235,6 +237,9 @@ def diagnose_fully(
     if cut:
         note = f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found."
         verdict = replace(verdict, notes=(*verdict.notes, note))
+    doubts = mislabelled(given)
+    if doubts:
+        verdict = withdrawn(verdict, doubts)
     return Diagnosis(
         verdict=verdict,
         robot=dataset.robot,
@@ -254,6 +259,17 @@ def diagnose_fully(
         candidates=tuple(
             tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
         ),
+    )
+
+
+def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
+    """The verdict on a recording whose labels are surely wrong: no name keeps more than half."""
+    return replace(
+        verdict,
+        causes=tuple(replace(c, probability=min(c.probability, known_probability(1.0, True))) for c in verdict.causes),
+        unexplained_verdict=UNKNOWN,
+        sentence=f"The recording looks mislabelled, so that no cause can be named: {doubts[0]}",
+        notes=(*verdict.notes, *doubts),
     )
 
 

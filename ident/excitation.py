@@ -30,6 +30,7 @@ PLAN_FORMAT = "simgap-plan/1"
 INJECTIONS = ("torque", "position")
 GRIDS = ("detection", "odd", "all")
 ROLES = ("identification", "validation")
+MOST_NUMBERS = 2 * 10**8  # of all samples of a channel: beyond, a plan does not fit into memory
 STRIDE = 10  # of the samples of a motion in a plan's file; the rest by cubic splines
 
 
@@ -295,6 +296,8 @@ def make_plan(
     """
     if injection not in INJECTIONS:
         raise DataError("injection", "plan", repr(injection), f"one of {INJECTIONS}")
+    runs = (points * min(levels_per_point or len(levels), len(levels)) + validation_points) * realizations
+    _check_size(runs * (experiments or robot.n) * period * periods, robot, "plan")
     if points < 1 or realizations < 1 or periods <= transient_periods or period < 64:
         raise DataError("plan", "points, realizations, periods, period", "a number too small", "at least one of each, and a steady period")
     if not 0 < band_hz[0] < band_hz[1] < 0.5 * sample_rate:
@@ -422,14 +425,30 @@ def plan_from_toml(path: str | Path) -> Plan:
         _lines(head, "lines", period, where),
         _lines(head, "detection", period, where),
     )
+    entries, motions = tables(head, "experiment", where), tables(head, "trajectory", where)
+    if not entries and not motions:
+        raise DataError("[[experiment]]", where, "none, and no [[trajectory]]", "at least one to run")
+    samples = len(entries) * period * periods + sum(whole(m, "samples", where, low=2 * STRIDE, high=10**7) for m in motions)
+    _check_size(samples, robot, where)
+    experiments = tuple(_experiment(e, x, robot, where) for e in entries)
+    trajectories = tuple(_trajectory(m, robot, where) for m in motions)
+    names = [*(e.name for e in experiments), *(m.name for m in trajectories)]
+    if len(set(names)) < len(names):
+        double = next(name for k, name in enumerate(names) if name in names[:k])
+        raise DataError("[[experiment]]", where, f"{double} twice", "each experiment once")
     return Plan(
         robot=robot,
         excitation=x,
-        experiments=tuple(_experiment(e, x, robot, where) for e in tables(head, "experiment", where)),
-        trajectories=tuple(_trajectory(m, robot, where) for m in tables(head, "trajectory", where)),
+        experiments=experiments,
+        trajectories=trajectories,
         injection=choice(head, "injection", where, INJECTIONS),
         seed=whole(head, "seed", where, low=0),
     )
+
+
+def _check_size(samples: int, robot: Robot, where: str) -> None:
+    if samples * robot.n > MOST_NUMBERS:
+        raise DataError("plan", where, f"{samples:.3g} samples of {robot.n} joints", f"at most {MOST_NUMBERS:g} numbers")
 
 
 def _knots(samples: int) -> np.ndarray:
@@ -449,7 +468,7 @@ def _experiment(entry: dict, x: Excitation, robot: Robot, where: str) -> Experim
     for key, unit in (("real", 1.0), ("imag", 1j)):
         X[x.lines] += unit * _rows(entry, key, len(x.lines), robot.n, where)
     return Experiment(
-        operating_point=text(entry, "operating_point", where),
+        operating_point=_file_name(entry, "operating_point", where),
         q0=vector(entry.get("q0"), "q0", where, robot.n),
         experiment=whole(entry, "experiment", where, low=1),
         realization=whole(entry, "realization", where, low=1),
@@ -459,12 +478,20 @@ def _experiment(entry: dict, x: Excitation, robot: Robot, where: str) -> Experim
     )
 
 
+def _file_name(entry: dict, key: str, where: str) -> str:
+    """A text that can begin the name of a file."""
+    value = text(entry, key, where)
+    if not value.isprintable() or "/" in value or "\\" in value or len(value) > 50:
+        raise DataError(key, where, ascii(value), "a name of at most 50 letters, without slashes")
+    return value
+
+
 def _trajectory(entry: dict, robot: Robot, where: str) -> Trajectory:
     samples = whole(entry, "samples", where, low=2 * STRIDE, high=10**7)
     at = _knots(samples)
     points = _rows(entry, "q_ref", len(at), robot.n, where)
     motion = CubicSpline(at, points)(np.arange(samples))
-    return Trajectory(text(entry, "name", where), motion, choice(entry, "role", where, ROLES))
+    return Trajectory(_file_name(entry, "name", where), motion, choice(entry, "role", where, ROLES))
 
 
 def _rows(entry: dict, key: str, count: int, n: int, where: str) -> np.ndarray:

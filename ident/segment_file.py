@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from ident.unpacked import check_size
 from robot_assets.errors import DataError
 from robot_assets.values import exists
 
@@ -54,13 +55,17 @@ def _columns(path: Path, where: str) -> dict[str, np.ndarray]:
         raise DataError("file", where, path.name, "a .parquet or .csv file")
     try:
         if kind == ".parquet":
-            rows = pq.read_metadata(path).num_rows
+            file = pq.ParquetFile(path)
+            names = file.schema_arrow.names
+            ours = [n for n in dict.fromkeys(names) if is_ours(n)]
+            rows = file.metadata.num_rows
             if rows > LONGEST:
                 raise DataError("samples", str(path), f"{rows}", f"at most {LONGEST}")
-            table = pq.read_table(path, partitioning=None)
+            check_size(path, 8 * rows * len(ours))
+            table = file.read(columns=ours)
         else:
             table = pa.csv.read_csv(path)
-        names = table.column_names
+            names = table.column_names
     except (pa.ArrowException, OSError, ValueError, MemoryError) as err:
         reason = str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__
         raise DataError("file", str(path), f"unreadable ({reason})", "a complete Parquet or CSV file") from err

@@ -37,6 +37,7 @@ NOISE = 1e-4  # torque noise over the torque limit
 ENCODER = {False: 3e-6, True: 1e-6}  # position noise, rad or (True: prismatic) m
 VELOCITY = {False: np.pi, True: 1.0}  # velocity limit where the URDF has none, rad/s or m/s
 Carrier = tuple[int, np.ndarray, np.ndarray, bool]  # joint, axis, a point of the axis, linear
+MOST = 100  # driven joints
 LINEAR_UNITS = {"rad": "m", "N m": "N", "kg m2": "kg"}
 
 
@@ -89,6 +90,8 @@ def draft_robot(urdf: str | Path, lock: Mapping[str, float | None] | None = None
     names = [name for name in elements if name in tree.limits and name not in locked]
     if not names:
         raise DataError("joints", str(path), "no movable joint that is free", "at least one to drive")
+    if len(names) > MOST:
+        raise DataError("joints", str(path), f"{len(names)} that are free", f"at most {MOST}: lock the others")
     inertia, weight = _seen(root, tree, names, locked)
     guesses, warnings = [], []
     for j, name in enumerate(names):
@@ -113,6 +116,8 @@ def write_robot(
         DataError: as ``draft_robot``; where ``out`` exists and is not empty, so that no edited file is lost.
     """
     source, target = Path(urdf), Path(out).absolute()
+    if not source.name.isprintable():
+        raise DataError("URDF", str(urdf), f"{source.name!a} for a name", "one that can be printed")
     draft = draft_robot(source, lock)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise DataError("--out", str(out), "something there already", "a new or empty folder")
@@ -246,37 +251,39 @@ def _seen(
         children.setdefault(_link(joint, "parent"), []).append(joint)
     (base,) = set(bodies) - {_link(j, "child") for j in joints}
     inertia, weight = np.zeros((POSTURES, len(names))), np.zeros((POSTURES, len(names)))
-    for p in range(POSTURES):
-        q = dict(zip(names, rng.uniform(low, high), strict=True)) | locked
-        # Depth first, without recursion: a chain may be longer than Python's stack.
-        stack: list[tuple[str, Rotation, np.ndarray, tuple[Carrier, ...]]] = [(base, Rotation.identity(), np.zeros(3), ())]
-        while stack:
-            link, R, x, above = stack.pop()
-            mass, com, tensor = bodies[link]
-            at, I = x + R.apply(com), R.as_matrix() @ tensor @ R.as_matrix().T
-            for j, axis, origin, linear in above:
-                arm = at - origin
-                if linear:
-                    inertia[p, j] += mass
-                    weight[p, j] += mass * GRAVITY * axis[2]
+    q = dict(zip(names, rng.uniform(low, high, (POSTURES, len(names))).T, strict=True))
+    q |= {name: np.full(POSTURES, at) for name, at in locked.items()}
+    # All postures at once, (POSTURES, 3, 3) and (POSTURES, 3); without recursion: a chain may be longer than Python's stack.
+    start = np.broadcast_to(np.eye(3), (POSTURES, 3, 3))
+    stack: list[tuple[str, np.ndarray, np.ndarray, tuple[Carrier, ...]]] = [(base, start, np.zeros((POSTURES, 3)), ())]
+    while stack:
+        link, R, x, above = stack.pop()
+        mass, com, tensor = bodies[link]
+        at, I = x + R @ com, R @ tensor @ R.transpose(0, 2, 1)
+        for j, axis, origin, linear in above if mass or tensor.any() else ():
+            arm = at - origin
+            if linear:
+                inertia[:, j] += mass
+                weight[:, j] += mass * GRAVITY * axis[:, 2]
+            else:
+                along = np.sum(axis * arm, axis=1)
+                inertia[:, j] += np.einsum("pi,pij,pj->p", axis, I, axis) + mass * (np.sum(arm**2, axis=1) - along**2)
+                weight[:, j] += mass * GRAVITY * (axis[:, 0] * arm[:, 1] - axis[:, 1] * arm[:, 0])
+        for joint in children.get(link, []):
+            R_origin, x_origin = _origin(joint)
+            R_joint, x_joint = R @ R_origin.as_matrix(), x + R @ x_origin
+            name, slides, carried = joint.get("name", ""), joint.get("type") == "prismatic", above
+            if joint.get("type") != "fixed":
+                own = _three(joint.find("axis"), "xyz", "1 0 0")
+                own = own / np.linalg.norm(own)
+                axis = R_joint @ own
+                if name in names:
+                    carried = (*above, (names.index(name), axis, x_joint, slides))
+                if slides:
+                    x_joint = x_joint + axis * q[name][:, None]
                 else:
-                    inertia[p, j] += axis @ I @ axis + mass * (arm @ arm - (axis @ arm) ** 2)
-                    weight[p, j] += mass * GRAVITY * np.cross(axis, arm)[2]
-            for joint in children.get(link, []):
-                R_origin, x_origin = _origin(joint)
-                R_joint, x_joint = R * R_origin, x + R.apply(x_origin)
-                name, slides, carried = joint.get("name", ""), joint.get("type") == "prismatic", above
-                if joint.get("type") != "fixed":
-                    own = _three(joint.find("axis"), "xyz", "1 0 0")
-                    own = own / np.linalg.norm(own)
-                    axis = R_joint.apply(own)
-                    if name in names:
-                        carried = (*above, (names.index(name), axis, x_joint, slides))
-                    if slides:
-                        x_joint = x_joint + axis * q[name]
-                    else:
-                        R_joint = R_joint * Rotation.from_rotvec(own * q[name])
-                stack.append((_link(joint, "child"), R_joint, x_joint, carried))
+                    R_joint = R_joint @ Rotation.from_rotvec(own * q[name][:, None]).as_matrix()
+            stack.append((_link(joint, "child"), R_joint, x_joint, carried))
     weight = np.abs(weight)
     return inertia, np.where(weight < 1e-9 * max(weight.max(), 1e-300), 0.0, weight)
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
+from xml.parsers import expat
 
 import numpy as np
 
 from robot_assets.errors import DataError
+from robot_assets.values import LARGEST
 
 MOVABLE = ("revolute", "continuous", "prismatic")
+MOST = 1000  # links, and joints
+NEGATIVE = 1e-3  # of the largest moment of inertia: what rounding in a file may leave below zero
+DEEPEST = 100  # elements inside elements: parsers of the engines recurse
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,8 @@ def read_urdf(path: Path) -> Description:
     links = [_name(e, "link", path) for e in root.findall("link")]
     joints = [(_name(e, "joint", path), e) for e in root.findall("joint")]
     for names, kind in ((links, "link"), ([name for name, _ in joints], "joint")):
+        if len(names) > MOST:
+            raise DataError(f"{kind}s", str(path), f"{len(names)}", f"at most {MOST}")
         double = {n for n in names if names.count(n) > 1}
         if double:
             raise DataError(f"{kind} {min(double)}", str(path), "it twice", "distinct names")
@@ -73,18 +80,37 @@ def read_urdf(path: Path) -> Description:
 
 def _root(path: Path) -> ET.Element:
     text = path.read_bytes()
-    if b"<!ENTITY" in text:
-        raise DataError("URDF", str(path), "an entity declaration", "a URDF without entities")
+    depth = 0
+
+    def refuse(*_: object) -> None:
+        raise DataError("URDF", str(path), "a document type or an entity declaration", "a URDF without one")
+
+    def enter(*_: object) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise DataError("URDF", str(path), f"more than {DEEPEST} elements inside each other", "a URDF")
+
+    def leave(*_: object) -> None:
+        nonlocal depth
+        depth -= 1
+
+    look = expat.ParserCreate()
+    look.StartDoctypeDeclHandler, look.StartElementHandler, look.EndElementHandler = refuse, enter, leave
     try:
-        return ET.fromstring(text)
-    except (ET.ParseError, ValueError, LookupError) as err:
+        look.Parse(text, True)
+        root = ET.fromstring(text)
+    except (expat.ExpatError, ET.ParseError, ValueError, LookupError) as err:
         raise DataError("URDF", str(path), f"invalid XML ({err})", "a readable URDF") from err
+    if root.tag != "robot":
+        raise DataError("URDF", str(path), f"<{root.tag}> at the top", "<robot>")
+    return root
 
 
 def _name(element: ET.Element, kind: str, path: Path) -> str:
     name = element.get("name")
-    if not name:
-        raise DataError(f"{kind} name", str(path), repr(name), "a name")
+    if not name or not name.isprintable():
+        raise DataError(f"{kind} name", str(path), repr(name), "a name that can be printed")
     return name
 
 
@@ -120,10 +146,12 @@ def _check_inertial(inertial: ET.Element | None, link: str, path: Path) -> None:
         raise DataError(f"inertial of link {link}", str(path), "no mass or no inertia", "both")
     if _number(mass.get("value"), f"mass of link {link}", path) < 0:
         raise DataError(f"mass of link {link}", str(path), str(mass.get("value")), "at least zero")
-    for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"):
-        value = _number(tensor.get(key, "0"), f"{key} of link {link}", path)
-        if key in ("ixx", "iyy", "izz") and value < 0:
-            raise DataError(f"{key} of link {link}", str(path), f"{value:g}", "at least zero")
+    xx, yy, zz, xy, xz, yz = (
+        _number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    )
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if moments.min() < -NEGATIVE * np.abs(moments).max():
+        raise DataError(f"inertia of link {link}", str(path), f"a moment of {moments.min():.3g} kg m2", "moments of at least zero")
 
 
 def _numbers(origin: ET.Element | None, what: str, path: Path) -> None:
@@ -143,6 +171,6 @@ def _number(word: str | None, what: str, path: Path) -> float:
         value = float(str(word))
     except ValueError:
         value = np.nan
-    if not np.isfinite(value):
-        raise DataError(what, str(path), repr(word), "a finite number")
+    if not abs(value) <= LARGEST:
+        raise DataError(what, str(path), repr(word), f"a number of at most {LARGEST:g}")
     return value

@@ -9,7 +9,9 @@ import numpy as np
 from mujoco.batch import Batch
 
 from sim.effects.effect import Run, State
-from sim.plant import Plant
+from sim.plant import Plant, without_engine_log
+
+FARTHEST = 50.0  # rad or m: beyond, a simulation has diverged
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Record:
     q_link: np.ndarray
 
 
+@without_engine_log
 def run_loop(
     plant: Plant,
     qpos: np.ndarray,
@@ -119,6 +122,9 @@ def run_loop(
                     if not late:
                         now = x[:, m[j]] if channel == "q" else x[:, a[j]]
                         seen[channel][:, j] = step(now.copy(), i == substeps - 1)
+        if k % 50 == 0 and _lost(q[:, k]):
+            q[:, k:] = np.nan
+            break
         if progress is not None and k % 50 == 0:
             progress(k / samples)
     if progress is not None:
@@ -174,6 +180,10 @@ def _fine_step(
 
 def failed(plant: Plant, record: Record) -> bool:
     """Whether a simulation has diverged."""
-    return not np.all(np.isfinite(record.q)) or bool(np.abs(record.q).max() > 50.0)
+    return _lost(record.q)
+
+
+def _lost(q: np.ndarray) -> bool:
+    return not bool(np.abs(q).max() <= FARTHEST)  # NaN too
 
 

@@ -8,8 +8,10 @@ Every driven joint is a hinge of the chain (``link:<joint>``) and a rotor beside
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import mujoco
 import numpy as np
@@ -18,8 +20,29 @@ from scipy.spatial.transform import Rotation
 from robot_assets.errors import DataError
 from robot_assets.robot import Elasticity, Robot
 
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
 REST_STEPS = 100
 DRIVE_FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
+
+
+def without_engine_log(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Keeps the engine from writing its warnings to the terminal and to a file where the user stands."""
+
+    @wraps(function)
+    def quiet(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        config = mujoco.MjLogConfig.get()
+        before = config.logto_console, config.logto_file
+        config.logto_console = config.logto_file = False
+        mujoco.MjLogConfig.set(config)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            config.logto_console, config.logto_file = before
+            mujoco.MjLogConfig.set(config)
+
+    return quiet
 
 
 @dataclass(frozen=True)
@@ -135,6 +158,7 @@ def gravity_torque(plant: Plant, q: np.ndarray) -> np.ndarray:
     return (data.qfrc_bias - data.qfrc_passive)[plant.link]
 
 
+@without_engine_log
 def rest(plant: Plant, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """State at rest with the motors at ``q`` (n,): (qpos, holding torque at the motors).
 

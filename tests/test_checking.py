@@ -112,6 +112,11 @@ FAULTS = {
     "one direction": (lambda s: replace(s, q=change(s.q, 0, lambda x: np.linspace(0, 1, len(x)) + 1e-6 * x), qd=None, q_link=None), "joints 1 move in one direction"),
     "filtered": (lambda s: replace(s, tau=smooth(s.tau)), "the log was filtered"),
     "torque late": (lambda s: replace(s, tau=np.roll(s.tau, 6, axis=0)), "torque comes 12 ms after"),
+    "torque of the wrong sign": (lambda s: replace(s, tau=-s.tau), "tau_1 (shoulder_pan_joint) runs against"),
+    "one torque of the wrong sign": (lambda s: replace(s, tau=change(s.tau, 2, np.negative)), "tau_3 (elbow_joint) runs against"),
+    "one torque before the gear": (lambda s: replace(s, tau=change(s.tau, 1, lambda x: x / 101)), "tau_2 (shoulder_lift_joint) is 0.0"),
+    "torques swapped": (lambda s: replace(s, tau=s.tau[:, [0, 2, 1, 3, 4, 5]]), "tau_2 (shoulder_lift_joint) follows what joint 3 needs"),
+    "a position of the wrong sign": (lambda s: replace(s, q=change(s.q, 1, np.negative), qd=None, q_link=None), "what"),
     "link late": (lambda s: replace(s, q_link=np.roll(s.q_link, 2, axis=0)), "q_link_1 (shoulder_pan_joint) comes 4 ms after"),
 }
 
@@ -140,6 +145,20 @@ def test_a_fault_is_found(arm, log, fault):
     make, expected = FAULTS[fault]
     found = warnings(arm, make(log))
     assert any(expected in w for w in found), found
+
+
+def test_a_wrong_sample_rate_is_found(arm, log):
+    s = replace(log, t=log.t / 2, qd=None, q_link=None)
+    found = inspect_dataset(replace(dataset(arm, s), sample_rate=2 * RATE)).warnings
+    assert any("wrong unit, or sample rate" in w for w in found), found
+
+
+def test_an_experiment_in_which_nothing_moves_is_found(clean):
+    data, _ = clean
+    rng = np.random.default_rng(0)
+    s = data.segments[0]
+    still = replace(data, segments=(replace(s, q=s.q[:1] + 3e-6 * rng.normal(size=s.q.shape)),))
+    assert any("joints 1, 2, 3, 4, 5, 6 hardly move" in w for w in inspect_dataset(still).warnings)
 
 
 @pytest.mark.parametrize("late", [-0.008, 0.0, 0.0035])

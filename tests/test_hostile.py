@@ -297,3 +297,21 @@ def test_positions_in_a_unit_that_cannot_be_are_one_line(ur10):
 
     wave = np.sin(np.arange(1500) / 80.0)[:, None] * np.ones(6)
     assert "positions" in outcome(diagnose, bare_motion(ur10, 1e6 * wave, wave))
+
+
+@pytest.mark.slow
+def test_a_log_of_mislabelled_torques_names_no_cause(tmp_path):
+    """Its torques are those of another sign: what is left then fits many an effect well."""
+    from dataclasses import replace
+
+    from ident.diagnose import diagnose
+    from sim import run_experiment
+    from tests.conftest import small_plan
+
+    data = run_experiment(small_plan(load_robot("twomass"), 3, points=1, levels=(1.0,)), seed=3)
+    wrong = replace(data, segments=tuple(replace(s, tau=-s.tau) for s in data.segments))
+    verdict = diagnose(wrong, max_causes=1, max_seconds=5)
+    assert all(c.probability < 0.5 for c in verdict.causes)
+    assert "mislabelled" in verdict.sentence and "wrong sign" in verdict.notes[-1]
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    assert "mislabelled" not in diagnose(data, max_causes=1, max_seconds=5).sentence

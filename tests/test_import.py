@@ -226,10 +226,10 @@ def test_roles_and_split(tmp_path, slide):
 
 
 def test_a_csv_with_semicolons_and_decimal_commas(tmp_path, slide):
-    (tmp_path / "log.csv").write_text("Kraft; Weg\n1,5;0,25\n-2,5;0,50\n")
+    (tmp_path / "log.csv").write_text("Kraft; Weg\n" + "1,5;0,25\n-2,5;0,50\n" * 8)
     (tmp_path / "map.toml").write_text('sample_rate = 10.0\n[columns]\ntau_1 = { source = "Kraft", unit = "N" }\nq_1 = { source = "Weg", unit = "m" }\n')
     s = convert_logs([tmp_path / "log.csv"], slide.folder, tmp_path / "map.toml").segments[0]
-    assert s.tau[:, 0].tolist() == [1.5, -2.5] and s.q[:, 0].tolist() == [0.25, 0.5]
+    assert s.tau[:, 0].tolist() == [1.5, -2.5] * 8 and s.q[:, 0].tolist() == [0.25, 0.5] * 8
 
 
 def test_lost_samples_are_said_and_a_wrong_unit_of_time_is_an_error(tmp_path, slide):

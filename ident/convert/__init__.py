@@ -11,6 +11,8 @@ import numpy as np
 from ident.convert.mapping import LogMap, read_map
 from ident.convert.reading import read_log
 from ident.dataset import Dataset, Segment
+from ident.dataset_io import check_segment_name
+from ident.segment_file import LARGEST, SHORTEST
 from robot_assets.errors import DataError
 from robot_assets.robot import ASSETS, load_robot
 
@@ -39,7 +41,12 @@ def convert_logs(
     log_map = read_map(map_path, arm.array("gear_ratio"))
     segments: list[Segment] = []
     for log_name, paths in _logs([Path(f) for f in files], log_map, str(map_path)):
-        segments += _segments(log_name, paths, log_map, arm.n, say)
+        found = _segments(log_name, paths, log_map, arm.n, say)
+        short = [s for s in found if s.n_samples < SHORTEST]
+        if short:
+            path = next(iter(paths.values()))
+            raise DataError("samples", str(path), f"{short[0].n_samples} of {short[0].name}", f"at least {SHORTEST} a segment")
+        segments += found
     if len({s.name for s in segments}) < len(segments):
         raise DataError("files", str(map_path), "two logs of one name", "distinct names")
     own = (ASSETS / arm.name).resolve() == arm.folder
@@ -60,6 +67,8 @@ def convert_logs(
 def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str, Path]]]:
     """Logs as (name, prefix -> file); the prefix is empty where a log is one file."""
     if not m.files:
+        for path in files:
+            check_segment_name(path.stem, str(path))
         return [(path.stem, {"": path}) for path in files]
     folders: dict[Path, dict[str, Path]] = {}
     for path in files:
@@ -82,7 +91,7 @@ def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str,
 
 def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
     if not m.files:
-        return read_log(paths[""], m.sources)
+        return read_log(paths[""], m.sources, m.time)
     data = {}
     for part in m.files:
         start = f"{part.prefix}:"
@@ -170,10 +179,14 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
         length = len(x)
         target = out.setdefault(c.channel, np.full((length, n), np.nan if c.channel == "q_link" else 0.0))
         target[:, c.joint] = x
-    bad = [k for k, v in out.items() if k != "q_link" and not np.all(np.isfinite(v))]
-    if bad:
-        k = int(np.flatnonzero(~np.isfinite(out[bad[0]]).all(axis=1))[0])
-        raise DataError(bad[0], str(path), f"a value that is not finite at sample {k}", "finite numbers")
+    for channel, x in out.items():
+        bad = ~np.isfinite(x) & ~(np.isnan(x) & (channel == "q_link"))
+        if np.any(bad):
+            k = int(np.flatnonzero(bad.any(axis=1))[0])
+            raise DataError(channel, str(path), f"a value that is not finite at sample {k}", "finite numbers")
+        if np.any(np.abs(x) > LARGEST):
+            k = int(np.flatnonzero((np.abs(x) > LARGEST).any(axis=1))[0])
+            raise DataError(channel, str(path), f"{np.nanmax(np.abs(x[k])):.3g} at sample {k}", f"at most {LARGEST:g} in SI units")
     if not length:
         raise DataError("signals", str(path), "no samples", "at least one")
     return out

@@ -7,10 +7,11 @@ joint states, the topic stands before: ``/left/joint_states:position.JOINT``.
 
 from __future__ import annotations
 
+import io
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from robot_assets.errors import DataError
 TYPES = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 FIELDS = ("position", "velocity", "effort")
 TIMES = ("stamp", "log_time")
+LARGEST_VALUE = 2**24  # bytes of one message
 # rosbag2 leaves the definition out of older SQLite files.
 JOINT_STATE = "\n".join(
     [
@@ -56,7 +58,8 @@ def _mcap_messages(path: Path, file: Any) -> Iterator[tuple[str, int, Any]]:
     for schema, channel, message in make_reader(file).iter_messages():
         if schema is None or schema.name not in TYPES:
             continue
-        decode = factory.decoder_for(channel.message_encoding, schema)
+        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # the parser of definitions prints its errors
+            decode = factory.decoder_for(channel.message_encoding, schema)
         if decode is None:
             found = f"{channel.message_encoding} with a {schema.encoding} schema"
             raise DataError(channel.topic, str(path), found, "cdr with a ros2msg schema")
@@ -68,6 +71,13 @@ def _db3_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
     decode = DecoderFactory().decoder_for(MessageEncoding.CDR, schema)
     uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(uri, uri=True)) as bag:
+        bag.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE)
+        for name in ("topics", "messages"):  # a view or a column that is computed may go on without end
+            kind = bag.execute("SELECT type FROM sqlite_master WHERE name = ?", (name,)).fetchone()
+            computed = [c[1] for c in bag.execute(f"PRAGMA table_xinfo({name})") if c[6]]
+            if kind != ("table",) or computed:
+                found = "no such table" if kind is None else f"computed column {computed[0]}" if computed else f"a {kind[0]}"
+                raise DataError(name, str(path), found, "a table of rosbag2")
         topics = {
             key: name
             for key, name, kind, form in bag.execute("SELECT id, name, type, serialization_format FROM topics")

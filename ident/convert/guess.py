@@ -20,6 +20,7 @@ from robot_assets.errors import DataError
 from robot_assets.robot import Robot, linear_joints, load_robot
 
 SHORTEST = 20  # samples; anything shorter is no signal but a setting
+LARGEST = 1e30  # no stamp, in any unit, is beyond
 RATES = (20.0, 50e3)  # Hz: a log of an arm is sampled between
 CHANNELS = ("tau", "q", "qd", "q_ref", "q_link", "temp")
 # Words in names, and how surely each tells. One letter tells little.
@@ -66,7 +67,8 @@ def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
     paths = [Path(f) for f in files]
     if not paths:
         raise DataError("files", "command line", "none", "at least one log")
-    logs = [list_signals(p) for p in paths]
+    # Damaged values are no reason to guess nothing: the conversion names them.
+    logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in list_signals(p).items()} for p in paths]
     parts = _parts(paths, logs, arm.n)
     signals = _joined(paths, logs, parts) if parts else logs[0]
     lengths = [_length(x) for x in signals.values() if _length(x) >= SHORTEST]

@@ -142,6 +142,9 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
     lines = multisine.get("excited_lines", [])
     if not isinstance(lines, list) or not all(isinstance(k, int) and not isinstance(k, bool) and 0 < k < 2**53 for k in lines):
         raise DataError("multisine.excited_lines", where, show(lines), "whole numbers from 1")
+    period = whole(multisine, "period", where, low=4) if multisine else None
+    if period is not None and lines and max(lines) >= period / 2:
+        raise DataError("multisine.excited_lines", where, f"line {max(lines)}", f"lines below Nyquist, {period / 2:g}")
     roles = subtable(data, "roles", where)
     return LogMap(
         sample_rate=number(data, "sample_rate", where, low=1e-3, high=1e7),
@@ -150,7 +153,7 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
         time_factor=_unit(time.get("unit", "s"), "time", where),
         files=tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items()),
         columns=columns,
-        period=whole(multisine, "period", where, low=4) if multisine else None,
+        period=period,
         parts=parts,
         operating_point=text(multisine, "operating_point", where, "op01"),
         excited_from=text(multisine, "excited_from", where) if "excited_from" in multisine else None,

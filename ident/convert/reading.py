@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
 VALUES = "values"  # name of the whole table of a text file without a header
@@ -19,8 +20,11 @@ DEEPEST = 8  # structures inside structures that are looked into
 Signals = dict[str, np.ndarray]
 
 
-def read_log(path: Path, wanted: set[str]) -> Signals:
+def read_log(path: Path, wanted: set[str], time: str | None = None) -> Signals:
     """The wanted signals of a log; a dot reaches into structures ("rec.act_pos").
+
+    Args:
+        time: the one that may be dates.
 
     Raises:
         DataError: where the file is missing, of another format, unreadable, or lacks a signal.
@@ -32,9 +36,12 @@ def read_log(path: Path, wanted: set[str]) -> Signals:
             known = sorted(list_signals(path))
             raise DataError("signal", str(path), f"no {name}", f"one of {known[:30]}")
         try:
-            out[name] = np.asarray(data[name], float)
-        except (TypeError, ValueError) as err:
+            x = np.asarray(data[name])
+        except ValueError as err:  # ragged
             raise DataError("signal", str(path), f"{name} is no array of numbers", "numbers") from err
+        if x.dtype.kind not in ("fiubMm" if name == time else "fiub"):
+            raise DataError("signal", str(path), f"{name} is no array of numbers", "numbers")
+        out[name] = x.astype(float)
     return out
 
 
@@ -72,7 +79,7 @@ def _read(path: Path, wanted: set[str] | None) -> dict[str, Any]:
 
 
 def _csv(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         first, second = file.readline(), file.readline()
     if _numbers(first):
         return _text(path, wanted)
@@ -84,6 +91,7 @@ def _csv(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         convert_options=pa.csv.ConvertOptions(decimal_point="," if comma else "."),
     ) as reader:
         names = [n.strip() for n in reader.schema.names]
+        _distinct(names, wanted, path)
         keep = [i for i, n in enumerate(names) if wanted is None or n in wanted]
         parts: dict[str, list[np.ndarray]] = {names[i]: [] for i in keep}
         for batch in reader:
@@ -94,7 +102,7 @@ def _csv(path: Path, wanted: set[str] | None) -> dict[str, Any]:
 
 def _text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     """Numbers in rows, by blanks, commas, semicolons or tabs; names in a first line, or none."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         first = file.readline()
     words = _words(first)
     delimiter = next((c for c in ",;" if c in first), None)
@@ -107,7 +115,15 @@ def _text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         return {VALUES: x}
     if len(words) != x.shape[1]:
         raise ValueError(f"{len(words)} names over {x.shape[1]} columns")
+    _distinct(words, wanted, path)
     return {n: x[:, i] for i, n in enumerate(words)}
+
+
+def _distinct(names: list[str], wanted: set[str] | None, path: Path) -> None:
+    """Raise a DataError where a signal that is wanted stands in two columns."""
+    double = sorted({n for n in names if names.count(n) > 1 and (wanted is None or n in wanted)}) if len(set(names)) < len(names) else []
+    if double:
+        raise DataError("signal", str(path), f"{double[0]} twice", "each signal once")
 
 
 def _words(line: str) -> list[str]:
@@ -126,12 +142,25 @@ def _numbers(line: str) -> bool:
 
 
 def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    names = pa.parquet.read_schema(path).names
-    table = pa.parquet.read_table(path, columns=[n for n in names if wanted is None or n in wanted], partitioning=None)
+    file = pa.parquet.ParquetFile(path)
+    schema = file.schema_arrow
+    _distinct(schema.names, wanted, path)
+    names = [n for n in schema.names if (wanted is None or n in wanted) and _holds_numbers(schema.field(n).type)]
+    check_size(path, 8 * file.metadata.num_rows * len(names))
+    table = file.read(columns=names)
     return {n: table.column(n).to_numpy() for n in table.column_names}
 
 
+def _holds_numbers(kind: pa.DataType) -> bool:
+    """Whether values of a type are numbers or dates."""
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_temporal)
+    return any(test(kind) for test in tests)
+
+
 def _npz(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+    check_zip(path, wanted)
     with np.load(path, allow_pickle=False) as file:
         return {n: file[n] for n in file.files if wanted is None or n in wanted}
 
@@ -140,20 +169,11 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     import h5py
     import scipy.io
 
-    out: dict[str, Any] = {}
     if h5py.is_hdf5(path):
         with h5py.File(path) as file:
-
-            def visit(name: str, item: Any) -> None:
-                dotted = name.replace("/", ".")
-                if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
-                    text = item.attrs.get("MATLAB_class", b"") == b"char"
-                    if not text and not item.attrs.get("MATLAB_empty", 0) and (wanted is None or dotted in wanted):
-                        # MATLAB's first dimension is the file's last.
-                        out[dotted] = np.asarray(item).T
-
-            file.visititems(visit)
-        return out
+            return _hdf5(path, file, wanted)
+    check_matlab(path)
+    out: dict[str, Any] = {}
 
     def walk(name: str, value: Any, depth: int) -> None:
         if hasattr(value, "_fieldnames"):
@@ -168,8 +188,32 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return out
 
 
+def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
+    """Arrays of numbers of a MATLAB 7.3 file."""
+    import h5py
+
+    found: dict[str, Any] = {}
+
+    def visit(name: str, item: Any) -> None:
+        dotted = name.replace("/", ".")
+        if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
+            text = item.attrs.get("MATLAB_class", b"") == b"char"
+            if not text and not item.attrs.get("MATLAB_empty", 0) and (wanted is None or dotted in wanted):
+                found[dotted] = item
+
+    file.visititems(visit)
+    for name, item in found.items():
+        if item.external or item.is_virtual:
+            raise DataError("signal", str(path), f"{name}, which stands in another file", "one in the file itself")
+    check_size(path, sum(item.size * item.dtype.itemsize for item in found.values()))
+    # MATLAB's first dimension is the file's last.
+    return {name: np.asarray(item).T for name, item in found.items()}
+
+
 def _mcap(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     from ident.convert.bags import read_mcap
+
+    check_mcap(path)
 
     return read_mcap(path, wanted)
 

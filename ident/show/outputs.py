@@ -18,7 +18,7 @@ def write_outputs(diagnosis: Diagnosis, out: str | Path) -> None:
     """verdict.json, report.html, recording.rrd, model.toml and model.xml, and next_plan.toml where an
     experiment would separate what the data do not; all or none.
     """
-    with outputs_into(out) as folder:
+    with outputs_into(out, without=(NEXT_PLAN,)) as folder:
         diagnosis.verdict.save(folder)
         write_report(diagnosis, folder / "report.html")
         write_recording(diagnosis, folder / "recording.rrd")
@@ -26,5 +26,3 @@ def write_outputs(diagnosis: Diagnosis, out: str | Path) -> None:
         write_mjcf(diagnosis, folder / "model.xml")
         if diagnosis.next_plan is not None:
             plan_to_toml(diagnosis.next_plan, folder / NEXT_PLAN)
-    if diagnosis.next_plan is None:
-        (Path(out) / NEXT_PLAN).unlink(missing_ok=True)  # that of an earlier diagnosis

@@ -12,10 +12,25 @@ import rerun.blueprint as rrb
 from ident.graybox import build_structure
 from ident.show.figures import frf_picture, rounded, unit_suffix
 from ident.verdict import Diagnosis, TorqueTrace
+from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 
+FOOTER = 32  # bytes at the end of a recording, its mark among them
 FRAMES_PER_SECOND = 30.0
 COLORS = {"measured": [150, 150, 150], "before": [200, 85, 61], "after": [42, 127, 158]}
+
+
+def check_recording(path: Path) -> None:
+    """Raise a DataError where a file is no whole recording; the viewer would show an empty window."""
+    try:
+        with path.open("rb") as file:
+            start, end = file.read(4), path.stat().st_size - FOOTER
+            file.seek(max(end, 0))
+            whole = start == b"RRF2" and b"RRF2FOOT" in file.read()
+    except OSError as err:
+        raise DataError("recording", str(path), str(err.strerror or err), "the recording.rrd of `simgap diagnose`") from err
+    if not whole:
+        raise DataError("recording", str(path), "no whole recording of rerun", "the recording.rrd of `simgap diagnose`")
 
 
 def write_recording(diagnosis: Diagnosis, path: Path) -> None:

@@ -41,6 +41,11 @@ _CLASSES = (
     sensing.SensorDelay,
     sensing.SensorLag,
 )
+VECTORS = ("com", "axis")
+DIVISORS = ("stribeck_velocity", "low_stiffness", "transition", "time_constant", "resolution", "yield_torque", "mass", "inertia")
+SIZES = ("torque", "coulomb", "static", "stiffness", "damping", "delay", "limit", "gap", "friction", "coefficient", "cubic")
+LEAST, LARGEST = 1e-12, 1e12  # sizes of parameters, SI
+LONGEST = 1.0  # s of a delay
 EFFECTS = {c.name: c for c in _CLASSES}
 
 
@@ -92,8 +97,10 @@ def parse_effect(text: str, robot: Robot) -> object:
         raise DataError("place", text, place, f"one of {places}")
     values: dict[str, object] = {}
     for item in filter(None, (rest or "").split(",")):
-        key, _, value = item.partition("=")
-        values[key.strip()] = _value(key.strip(), value.strip(), text)
+        key, _, value = (part.strip() for part in item.partition("="))
+        if key in values:
+            raise DataError(f"parameter {key}", text, "it twice", "each parameter once")
+        values[key] = _value(key, value, text)
     if not values:
         return draw_effect(np.random.default_rng(0), robot, names=(name,), place=place)
     return make_effect(name, place, **values)
@@ -117,11 +124,18 @@ def valid_places(name: str, robot: Robot) -> list[str]:
 def _value(key: str, text: str, where: str) -> object:
     if key == "channel":
         return text
+    count = 3 if key in VECTORS else 1
     try:
         numbers = tuple(float(v) for v in text.split())
-    except ValueError as err:
-        raise DataError(f"parameter {key}", where, repr(text), "a number, or three with spaces") from err
-    return numbers[0] if len(numbers) == 1 else numbers
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(abs(v) <= LARGEST for v in numbers):
+        raise DataError(f"parameter {key}", where, repr(text), "three numbers with spaces" if count == 3 else "a number")
+    low = LEAST if key in DIVISORS else 0.0 if key in SIZES else -LARGEST
+    high = LONGEST if key == "delay" else LARGEST
+    if count == 1 and not low <= numbers[0] <= high:
+        raise DataError(f"parameter {key}", where, repr(text), f"a number from {low:g} to {high:g}")
+    return numbers if count == 3 else numbers[0]
 
 
 def draw_effect(

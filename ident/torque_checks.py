@@ -1,0 +1,138 @@
+"""Whether the torques of a recording are those that its motion asks for: signs, sizes, order of columns, units of time.
+
+The torque that the bodies of the description, the motors and gravity need along the measured motion is compared with the
+one recorded, joint by joint and across joints, friction and an offset of each joint left free. Descriptions are wrong by some
+ten per cent and drives by a factor of two, so only what is far outside is said.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+import scipy.signal
+
+from ident.channel_checks import anti_resonance
+from ident.dataset import Dataset, Segment
+from ident.graybox import build_structure
+
+SEGMENTS = 6  # of a dataset, that a diagnosis looks at
+BAND = 12.0  # Hz, at most: below, links follow their motors
+BELOW = 0.5  # of the lowest anti-resonance
+SETTLED = 0.3  # s: the filter of the band has forgotten the ends of the log
+LONGEST = 1000  # instants compared
+LEAST = 160  # the same
+ALIKE = 0.7  # correlation above which sizes are compared
+APART = 0.6  # correlation below which two torques have little to do with each other
+FAR = 8.0  # ratio of sizes that no error of a drive or a body explains
+ALL = 2.5  # the same, of the middle joint
+LARGE = 0.6, 2.0  # size of what is needed over what was recorded, at two joints or more, or at one
+AGAINST = -0.2, 0.5  # correlation below and size above which one joint is enough
+BETTER = 0.5  # of the part of a torque not explained by its own joint, that another must leave at most
+
+
+@dataclass(frozen=True)
+class Match:
+    """Recorded torques against needed ones.
+
+    Attributes:
+        correlation: (n, n) of the torque recorded at i with the one needed at j, friction and offset removed.
+        slope: (n,) recorded torque over the needed one. size: (n,) rms needed over rms recorded.
+    """
+
+    correlation: np.ndarray
+    slope: np.ndarray
+    size: np.ndarray
+
+
+def match_torques(s: Segment, dataset: Dataset) -> Match | None:
+    """None where the segment is too short or nothing moves."""
+    rate, n = dataset.sample_rate, dataset.n
+    edge = int(rate * SETTLED) + 1
+    every = max(1, (len(s.q) - 2 * edge) // LONGEST)
+    pick = np.arange(edge, len(s.q) - edge, every)
+    if len(pick) < LEAST or not np.any(np.ptp(s.q, axis=0) > 0):
+        return None
+    cut = min(BAND, 0.2 * rate, BELOW * float(anti_resonance(s, dataset.robot).min()))
+    low = scipy.signal.butter(3, cut / (rate / 2), output="sos")
+    q, tau = (scipy.signal.sosfiltfilt(low, x, axis=0) for x in (s.q, s.tau))
+    v = np.gradient(q, 1 / rate, axis=0)
+    turns = scipy.signal.sosfiltfilt(low, np.sign(v), axis=0)[pick]
+    a = np.gradient(v, 1 / rate, axis=0)[pick]
+    q, tau, v = q[pick], tau[pick], v[pick]
+    structure = build_structure(dataset.robot)
+    data, full = structure.model.createData(), np.zeros((3, len(pick), structure.model.nv))
+    for k, x in enumerate((q, v, a)):
+        full[k][:, structure.driven] = x
+    needed = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(pick))])[:, structure.driven]
+    needed = needed + a * dataset.robot.array("motor_inertia")
+    C, slope, size = np.zeros((n, n)), np.zeros(n), np.zeros(n)
+    for j in range(n):
+        own = np.stack([v[:, j], turns[:, j], np.ones(len(v))], axis=1)
+        Q = np.linalg.qr(own / np.maximum(np.linalg.norm(own, axis=0), 1e-300))[0]
+        need, got = (x - Q @ (Q.T @ x) for x in (needed[:, j], tau))
+        lengths = np.maximum(np.linalg.norm(got, axis=0), 1e-300)
+        length = max(float(np.linalg.norm(need)), 1e-300)
+        C[:, j] = need @ got / lengths / length
+        slope[j], size[j] = C[j, j] * lengths[j] / length, length / lengths[j]
+    return Match(C, slope, size)
+
+
+def mislabelled(dataset: Dataset) -> list[str]:
+    """What is surely wrong in the labels of torques: said of more than half of the segments that were looked at."""
+    pick = np.unique(np.linspace(0, len(dataset.segments) - 1, SEGMENTS).round().astype(int))
+    found = [m for k in pick if (m := match_torques(dataset.segments[k], dataset)) is not None]
+    said = [contradictions(m, dataset.joints) for m in found]
+    kinds = Counter(key for one in said for key in one)
+    first = {key: text for one in reversed(said) for key, text in one.items()}
+    return [first[key] for key in sorted(kinds) if kinds[key] > len(found) / 2]
+
+
+def torque_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Signs, sizes and order of torques that the motion cannot have asked for."""
+    found = match_torques(s, dataset)
+    if found is None:
+        return []
+    return list(contradictions(found, dataset.joints).values()) or _doubts(found)
+
+
+def contradictions(found: Match, joints: tuple[str, ...]) -> dict[tuple[int, str], str]:
+    """(Joint, kind) -> what no error of a model explains: swapped columns, a wrong sign, another size."""
+    C, slope, own = found.correlation, found.slope, np.diag(found.correlation)
+    named = [f"tau_{j + 1} ({name})" for j, name in enumerate(joints)]
+    out: dict[tuple[int, str], str] = {}
+    said: set[int] = set()
+    for i in range(len(joints)):
+        for k in range(i):
+            crossed = min(C[i, k], C[k, i]) > ALIKE and all(1 - c**2 < BETTER * (1 - o**2) for c, o in ((C[i, k], own[i]), (C[k, i], own[k])))
+            if crossed and not said & {i, k}:
+                said |= {i, k}
+                out[k, "swapped"] = f"{named[k]} follows what joint {i + 1} needs and tau_{i + 1} what joint {k + 1} needs: columns swapped?"
+    for j in range(len(joints)):
+        if j in said or abs(own[j]) < ALIKE:
+            continue
+        if own[j] < 0:
+            out[j, "sign"] = f"{named[j]} runs against what bodies and motor need, {slope[j]:.3g} times it: wrong sign?"
+        elif not 1 / FAR < slope[j] < FAR:
+            out[j, "size"] = f"{named[j]} is {slope[j]:.3g} times what bodies and motor need: wrong unit, torque constant or side of the gear?"
+    return out
+
+
+def _doubts(found: Match) -> list[str]:
+    """What speaks against the labels, and may be an error of the model or poor data as well."""
+    out, slope, own = [], found.slope, np.diag(found.correlation)
+    sure = slope[own > ALIKE]
+    if len(sure) >= 3 and not 1 / ALL < np.median(sure) < ALL:
+        out.append(f"torques are about {np.median(sure):.2g} times what bodies and motors need: wrong unit, or sample rate?")
+    strange = (own < APART) & (found.size > LARGE[0])
+    against = (own < AGAINST[0]) & (found.size > AGAINST[1])
+    if np.sum(strange) > 1 or np.any(strange & (found.size > LARGE[1])) or np.any(against):
+        strange |= against
+        joints = ", ".join(str(j + 1) for j in np.flatnonzero(strange))
+        out.append(
+            f"the torque of joints {joints} has little to do with what their motion needs (correlation {own[strange].min():.2g}):"
+            " joints in another order, a wrong sign or zero of a position, strong friction, noise, or another robot?"
+        )
+    return out
