@@ -107,9 +107,10 @@ def fit_frf(
     # LLS hardly sees weak springs: an end that it likes may be far off by the wanted criterion.
     best = min(ends, key=lambda p: criterion.normal(p, criterion.linearised(p), free)[0]) if len(ends) > 1 else ends[0]
     for k in range(ROUNDS):
-        last, result = best.to_log(), _minimise(criterion, best, free, FINAL)
+        provisional = estimator == "wlls" and k == 0
+        last, result = best.to_log(), _minimise(criterion, best, free, SEARCH if provisional else FINAL)
         best = result.parameters
-        if estimator == "wlls" and k == 0:
+        if provisional:
             criterion = criterion.reweighted(best)
         elif np.max(np.abs(best.to_log() - last)) < SETTLED:
             break
