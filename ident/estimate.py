@@ -8,7 +8,7 @@ the measured entries in the search and from the fitted ones at the end.
 Deviations are those of noise, and of distortion as far as it differs between realizations. Two errors of a real
 record are neither, and hardly show in the misfit, being spread over many lines, but grow beside the noise with the
 length of the record: what the changing geometry adds at whatever phases (of second order in the excitation; for the
-ur10 at level 1 with two periods of 1 s 0.6 to 1.3 standard deviations, a tenth of that error at level 0.3), and
+ur10 at level 1 with two periods of 1 s 0.7 to 1.3 standard deviations, a quarter of it at half the level), and
 transients after too short a lead (0.3 there with one period of 1 s, none with three). A second level shows the former;
 the torque residual and the extended Kalman filter hold the geometry.
 """

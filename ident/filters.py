@@ -107,6 +107,13 @@ def particle_filter(
     is to be taken over steps that change it by more than that (``fit_prediction``, ``guide``). Slopes of the particles
     themselves are no way out: they are those of an arm without feedback, which weights would have to undo.
 
+    How far that reaches: on two joints of the ur10 with 2 x 2000 samples that count, the log-likelihood of 100 particles
+    at the true parameters is that of the extended filter less 80, +-33 over seeds (200: less 51, +-31), and between springs
+    0.1 % apart its change scatters by 35 although the random numbers are the same, for they meet other ancestors; one
+    standard deviation of a spring is worth 0.5. Drawing particles with the next sample in sight would not mend that: what
+    the torque noise of one sample moves is 1e-5 of the variance of the encoder. What would, a Kalman filter in each
+    particle, is the extended filter again on an arm as nearly linear as this.
+
     Raises:
         DataError: for runs that begin in motion: next to none of the particles would be near.
     """
