@@ -14,9 +14,11 @@ the true ones by up to two, and fit stiffness, damping, motor inertia and fricti
 
 "late": from the first WLLS estimate instead, for prediction errors have local minima. Seconds are of processor,
 compilation left out, and the median over the starts. A start has converged where every spring ends within 5 % of the
-truth and every damper within 50 %; errors are over those starts.
+truth and every damper within 50 %; errors are over those starts, or over all, marked "all", where none has. No fit takes
+more than ``LIMIT`` steps, each a Jacobian by differences; "cut" counts those that were stopped by it. Evaluations are
+runs of the predictor or of the simulation over all the data, the median over the starts.
 
-    python benchmarks/bench_prediction.py [--full]
+    python benchmarks/bench_prediction.py [--full] [--arms twomass pair ur10 irb]
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import argparse
 import contextlib
 import io
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -41,7 +43,7 @@ from ident.filters import extended_kalman, particle_filter
 from ident.frf import estimate_frf
 from ident.graybox import Parameters, Structure, build_structure, parameter_names
 from ident.kalman import local_predictor
-from ident.predict import Noise, PredictionFit, Runs, fit_prediction, runs_of
+from ident.predict import Noise, PredictionFit, Predictor, Runs, fit_prediction, runs_of
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, load_robot
 from sim import run_experiment
@@ -54,7 +56,24 @@ STEP = 1e-3  # s, of the simulations that are fitted, RK4; the data are of 0.25 
 SPRINGS, DAMPERS = 0.05, 0.5  # relative errors within which a start counts as converged
 RANGE = np.log(8.0)  # bounds of the fits by simulation, about their start
 PARTICLES = 100
+LIMIT = 30  # steps of a fit by prediction errors or by simulation
+ARMS = ("twomass", "pair", "ur10", "irb")
 NEAR = 0.01  # start of the particle filter, in log-parameters about the WLLS estimate
+
+
+@dataclass(frozen=True)
+class End:
+    """Where a fit ended.
+
+    Attributes:
+        parameters: there. evaluations: runs over all the data. cut: whether ``LIMIT`` ended it.
+        fit: with the noise, of prediction errors.
+    """
+
+    parameters: Parameters
+    evaluations: int | None = None
+    cut: bool = False
+    fit: PredictionFit | None = None
 
 
 @dataclass(frozen=True)
@@ -102,31 +121,24 @@ def first_noise(case: Case) -> Noise:
     return Noise(0.05 * case.runs.u.std(axis=(0, 1)), case.robot.array("q_std"))
 
 
-def wlls(case: Case, start: Parameters) -> Parameters:
+def wlls(case: Case, start: Parameters) -> End:
     frf = estimate_frf(case.data)
-    return fit_frf(
-        case.structure, frf, start, sample_time=case.runs.sample_time, hold="zoh", starts=(start,), fitted=parameter_names(case.robot)
-    ).parameters
-
-
-def local_pem(case: Case, start: Parameters) -> PredictionFit:
-    return fit_prediction(local_predictor(case.structure, case.runs), case.structure, start, first_noise(case))
-
-
-def ekf_pem(case: Case, start: Parameters) -> PredictionFit:
-    return fit_prediction(extended_kalman(case.structure, case.runs), case.structure, start, first_noise(case))
-
-
-def particles(case: Case, start: Parameters) -> PredictionFit:
-    return fit_prediction(
-        particle_filter(case.structure, case.runs, particles=PARTICLES),
-        case.structure,
-        start,
-        first_noise(case),
-        guide=extended_kalman(case.structure, case.runs),
-        steps=6,
-        promise=10.0,
+    return End(
+        fit_frf(
+            case.structure, frf, start, sample_time=case.runs.sample_time, hold="zoh", starts=(start,), fitted=parameter_names(case.robot)
+        ).parameters
     )
+
+
+def pem(case: Case, predictor: Predictor, start: Parameters, **options) -> End:
+    options = {"steps": LIMIT} | options
+    fit = fit_prediction(predictor, case.structure, start, first_noise(case), **options)
+    return End(fit.parameters, fit.evaluations, not fit.converged, fit)
+
+
+def particles(case: Case, start: Parameters) -> End:
+    predictor, guide = particle_filter(case.structure, case.runs, particles=PARTICLES), extended_kalman(case.structure, case.runs)
+    return pem(case, predictor, start, guide=guide, steps=6, promise=10.0)
 
 
 def drives_of(x: np.ndarray) -> dict[str, np.ndarray]:
@@ -134,7 +146,7 @@ def drives_of(x: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip(DRIVE_FIELDS, np.exp(x).reshape(4, -1), strict=True))
 
 
-def output_error(case: Case) -> Callable[[Parameters], Parameters]:
+def output_error(case: Case) -> Callable[[Parameters], End]:
     """Fit by the closed loop simulated in MuJoCo, weighted by what two periods of the record differ by."""
     segments, robot = case.data.select(role="identification", kind="multisine"), case.robot
     q0 = np.stack([s.q0 for s in segments])
@@ -148,22 +160,27 @@ def output_error(case: Case) -> Callable[[Parameters], Parameters]:
     signals = [x[:, skip:] for x in (case.runs.u, case.runs.y)]
     sizes = [np.std(x[:, :half] - x[:, half:], axis=(0, 1)) for x in signals]
 
+    looks = 0
+
     def residual(x: np.ndarray) -> np.ndarray:
+        nonlocal looks
+        looks += 1
         plant = build_plant(robot, drives=drives_of(x), timestep=STEP)
         start = np.stack([rest(plant, q)[0] for q in q0])
         run = run_loop(plant, start, q0[:, None], r, samples, loop, silent, case.data.sample_rate, np.random.default_rng(0), np.zeros(len(q0)))
         e = [(a - b[:, skip:]) / s for a, b, s in zip(signals, (run.tau, run.q), sizes, strict=True)]
         return np.clip(np.nan_to_num(np.concatenate([x.ravel() for x in e]), nan=1e6), -1e6, 1e6)
 
-    def fit(start: Parameters) -> Parameters:
-        x = start.to_log()
-        found = least_squares(residual, x, bounds=(x - RANGE, x + RANGE), diff_step=1e-6, max_nfev=30)
-        return start.with_log(found.x)
+    def fit(start: Parameters) -> End:
+        nonlocal looks
+        x, looks = start.to_log(), 0
+        found = least_squares(residual, x, bounds=(x - RANGE, x + RANGE), diff_step=1e-6, max_nfev=LIMIT)
+        return End(start.with_log(found.x), looks, found.status == 0)
 
     return fit
 
 
-def peer(case: Case) -> Callable[[Parameters], Parameters] | None:
+def peer(case: Case) -> Callable[[Parameters], End] | None:
     """Fit by mujoco.sysid; None where it is not installed."""
     try:
         from mujoco.sysid import (
@@ -220,7 +237,7 @@ def peer(case: Case) -> Callable[[Parameters], Parameters] | None:
         e = (state[runs.skip - 1 :, 1 + motors] - measured.data[runs.skip :]) / sigma
         return np.clip(np.nan_to_num(e, nan=1e9), -1e9, 1e9), measured, measured
 
-    def fit(start: Parameters) -> Parameters:
+    def fit(start: Parameters) -> End:
         x = start.to_log()
         sequences = []
         for p, q0 in enumerate(runs.q0):
@@ -240,17 +257,29 @@ def peer(case: Case) -> Callable[[Parameters], Parameters] | None:
         params = ParameterDict()
         for i, (kind, name) in enumerate((kind, name) for kind in DRIVE_FIELDS for name in robot.joint_names):
             params[f"{kind}.{name}"] = Parameter(f"{kind}.{name}", x[i], x[i] - RANGE, x[i] + RANGE, modifier=setter(kind, name))
-        residual = build_residual_fn(models_sequences=sequences, modify_residual=difference, resample_true=False, n_threads=1)
+        inner = build_residual_fn(models_sequences=sequences, modify_residual=difference, resample_true=False, n_threads=1)
+        looks, steps = 0, 0
+
+        def residual(x: np.ndarray, params: ParameterDict, **options):
+            nonlocal looks
+            looks += 1 if x.ndim == 1 else x.shape[1]  # a column a difference
+            return inner(x, params, **options)
+
+        def count(trace: list) -> None:
+            nonlocal steps
+            steps = len(trace)
+
         with contextlib.redirect_stdout(io.StringIO()):
-            found, _ = optimize(params, residual, optimizer="mujoco", verbose=False, max_iters=50)
-        return start.with_log(found.as_vector())
+            found, _ = optimize(params, residual, optimizer="mujoco", verbose=False, max_iters=LIMIT, iter_callback=count)
+        return End(start.with_log(found.as_vector()), looks, steps == LIMIT)
 
     return fit
 
 
-def timed(fit: Callable[[Parameters], Parameters | PredictionFit], starts: Sequence[Parameters]) -> tuple[list, list[float]]:
-    """(results, None for a failure; seconds of processor) from every start."""
-    out, seconds = [], []
+def timed(fit: Callable[[Parameters], End], starts: Sequence[Parameters]) -> tuple[list[End | None], list[float]]:
+    """(ends, None for a failure; seconds of processor) from every start."""
+    out: list[End | None] = []
+    seconds = []
     for start in starts:
         began = time.process_time()
         try:
@@ -265,52 +294,64 @@ def table(case: Case, *, filtered: bool = True, chance: bool = False, simulated:
     """Print a row a method."""
     runs, n = case.runs, case.robot.n
     print(f"{case.title}: {len(runs.u)} experiments x {runs.u.shape[1]} samples, {len(case.truth)} parameters, {len(case.starts)} starts")
-    print("method                 springs: median    worst   dampers: median    worst   converged   CPU s   x WLLS   evaluations")
+    print("method                     springs: median    worst   dampers: median    worst   converged   CPU s   x WLLS   evaluations   cut")
     base = None
 
-    def row(name: str, found: list, seconds: list[float]) -> None:
+    def row(name: str, ends: list[End | None], seconds: list[float]) -> None:
         nonlocal base
         base = base or float(np.median(seconds))
-        ends = [None if f is None else f.parameters if isinstance(f, PredictionFit) else f for f in found]
-        errors = np.abs(np.expm1(np.array([e.to_log() - case.truth for e in ends if e is not None]).reshape(-1, 4, n)))
-        good = (errors[:, 0].max(axis=1) < SPRINGS) & (errors[:, 1].max(axis=1) < DAMPERS) if len(errors) else np.zeros(0, bool)
-        cells = [f"{np.median(e):8.1e}   {e.max():6.1e}" for e in (errors[good, 0], errors[good, 1])] if good.any() else ["       -        -"] * 2
-        count = [f.evaluations for f in found if isinstance(f, PredictionFit)]
+        ended = [e for e in ends if e is not None]
+        errors = np.abs(np.expm1(np.array([e.parameters.to_log() - case.truth for e in ended]).reshape(-1, 4, n)))
+        good = (errors[:, 0].max(axis=1) < SPRINGS) & (errors[:, 1].max(axis=1) < DAMPERS)
+        shown = errors[good] if good.any() else errors
+        cells = [f"{np.median(e):8.1e}   {e.max():6.1e}" if len(ended) else "       -        -" for e in (shown[:, 0], shown[:, 1])]
+        count = [e.evaluations for e in ended if e.evaluations is not None]
         print(
-            f"{name:22s}        {cells[0]}          {cells[1]}   {good.sum():5d}/{len(found)}   {np.median(seconds):7.2f}   {np.median(seconds) / base:6.0f}"
-            + (f"   {np.median(count):11.0f}" if count else ""),
+            f"{name:26s}        {cells[0]}          {cells[1]}   {good.sum():5d}/{len(ends)} {' ' if good.any() else 'all'}"
+            f" {np.median(seconds):7.2f}   {np.median(seconds) / base:6.0f}"
+            + (f"   {np.median(count):11.0f}   {sum(e.cut for e in ended):3d}" if count else ""),
             flush=True,
         )
+
+    def both(name: str, fit: Callable[[Parameters], End]) -> End | None:
+        row(name, *timed(fit, case.starts))
+        late, seconds = timed(fit, [first])
+        row(f"{name}, late", late, seconds)
+        return late[0]
 
     wlls(case, case.starts[0])
     matched, seconds = timed(lambda s: wlls(case, s), case.starts)
     row("WLLS on FRFs", matched, seconds)
-    fits = [("local PEM", local_predictor, local_pem)] + [("EKF-PEM", extended_kalman, ekf_pem)] * filtered
-    for name, predictor, fit in fits:
-        predictor(case.structure, case.runs)(case.starts[0], first_noise(case))
-        row(name, *timed(lambda s, fit=fit: fit(case, s), case.starts))
-        late, seconds = timed(lambda s, fit=fit: fit(case, s), matched[:1])
-        row(f"{name}, late", late, seconds)
-    if chance and late[0] is not None:
-        few = replace(case.runs, u=case.runs.u[:, :2], y=case.runs.y[:, :2], skip=0)
-        particle_filter(case.structure, few, particles=2)(matched[0], late[0].noise)
-        near = matched[0].with_log(matched[0].to_log() + NEAR * np.resize([1.0, -1.0, -1.0, 1.0], len(case.truth)))
+    if matched[0] is None:
+        raise DataError("WLLS", case.title, "a failure at the first start", "an estimate that the others can begin with")
+    first = matched[0].parameters
+    def predicted(name: str, make: Callable[[Structure, Runs], Predictor]) -> End | None:
+        predictor = make(case.structure, runs)
+        predictor(case.starts[0], first_noise(case))
+        return both(name, lambda s: pem(case, predictor, s))
+
+    predicted("local PEM", local_predictor)
+    if simulated:
+        other = peer(case)
+        if other is None:
+            print("mujoco.sysid               skipped: not installed (pip install mujoco[sysid])")
+        else:
+            both("mujoco.sysid", other)
+        both("MuJoCo output error", output_error(case))
+    late = predicted("EKF-PEM", extended_kalman) if filtered else None
+    if chance and late is not None:
+        few = replace(runs, u=runs.u[:, :2], y=runs.y[:, :2], skip=0)
+        particle_filter(case.structure, few, particles=2)(first, late.fit.noise)
+        near = first.with_log(first.to_log() + NEAR * np.resize([1.0, -1.0, -1.0, 1.0], len(case.truth)))
         row("particle filter, near", *timed(lambda s: particles(case, s), [near]))
         draws = [
-            particle_filter(case.structure, case.runs, particles=PARTICLES, seed=seed)(late[0].parameters, late[0].noise).log_likelihood
+            particle_filter(case.structure, runs, particles=PARTICLES, seed=seed)(late.parameters, late.fit.noise).log_likelihood
             for seed in range(5)
         ]
         print(
-            f"  at the EKF estimate: log-likelihood of {PARTICLES} particles {np.mean(draws) - late[0].log_likelihood:.0f} to that of the EKF,"
+            f"  at the EKF estimate: log-likelihood of {PARTICLES} particles {np.mean(draws) - late.fit.log_likelihood:.0f} to that of the EKF,"
             f" +-{np.std(draws, ddof=1):.0f} over seeds; one standard deviation of a parameter is worth 0.5"
         )
-    if simulated:
-        row("MuJoCo output error", *timed(output_error(case), case.starts))
-        other = peer(case)
-        if other is None:
-            print("mujoco.sysid           skipped: not installed (pip install mujoco[sysid])")
-        else:
-            row("mujoco.sysid", *timed(other, case.starts))
     print(flush=True)
 
 
@@ -319,7 +360,7 @@ def equivalence(case: Case) -> None:
     names, start = parameter_names(case.robot), Parameters.nominal(case.robot).with_log(case.truth)
     frf = estimate_frf(case.data)
     match = fit_frf(case.structure, frf, start, sample_time=case.runs.sample_time, hold="zoh", estimator="wnls", starts=(start,), fitted=names)
-    local = local_pem(case, start)
+    local = fit_prediction(local_predictor(case.structure, case.runs), case.structure, start, first_noise(case))
     std = np.sqrt(np.diag(local.covariance))[: len(names)]
     apart = (local.parameters.to_log() - match.parameters.to_log()) / std
     ratio = np.sqrt(np.diag(match.covariance)) / std
@@ -359,21 +400,30 @@ def whole_arm() -> None:
     print(flush=True)
 
 
-def main(full: bool) -> None:
+def main(full: bool, arms: Collection[str]) -> None:
     starts = 10 if full else 2
     print(f"commit {commit()}")
-    bench, couple = (make_case("twomass", load_robot("twomass"), starts, level=30.0, high=200.0), make_case("two joints of the ur10", pair(), starts, level=1.0))
-    weak = make_case("two joints of the ur10, a tenth of the excitation", pair(), 1, level=0.1)
-    for case in (bench, couple, weak):
+    cases = []
+    if "twomass" in arms:
+        cases.append((make_case("twomass", load_robot("twomass"), starts, level=30.0, high=200.0), {}))
+    if "pair" in arms:
+        cases.append((make_case("two joints of the ur10", pair(), starts, level=1.0), {"chance": True}))
+        equivalence(make_case("two joints of the ur10, a tenth of the excitation", pair(), 1, level=0.1))
+    for case, _ in cases:
         equivalence(case)
     print()
-    table(bench)
-    table(couple, chance=True)
-    table(make_case("ur10", load_robot("ur10"), 3 if full else 1, level=1.0, points=2 if full else 1), filtered=full, simulated=full)
-    whole_arm()
+    if "ur10" in arms:
+        # Minutes a fit: one operating point and one start.
+        cases.append((make_case("ur10", load_robot("ur10"), 1, level=1.0), {"filtered": full, "simulated": full}))
+    for case, options in cases:
+        table(case, **options)
+    if "irb" in arms:
+        whole_arm()
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--full", action="store_true", help="ten starts, and all methods on the whole ur10")
-    main(parser.parse_args().full)
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="those to look at")
+    options = parser.parse_args()
+    main(options.full, options.arms)

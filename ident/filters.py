@@ -23,6 +23,7 @@ from ident.graybox import Parameters, Structure, equilibrium, linearise
 from ident.kalman import Kalman, held, kalman, spring_torque, state_space
 from ident.predict import Noise, Prediction, Predictor, Runs, gaussian
 from ident.recursion import _recursion, chain_of
+from robot_assets.errors import DataError
 
 NUDGE = 1e-6  # rad and rad/s, differences of inverse dynamics
 RESAMPLE = 0.5  # share of effective particles below which they are drawn anew
@@ -75,7 +76,7 @@ def _chain_arrays(structure: Structure) -> tuple[np.ndarray, ...]:
 
 
 def extended_kalman(structure: Structure, runs: Runs) -> Predictor:
-    """Predictor by an extended Kalman filter, from rest, of the arm with all its geometry."""
+    """Predictor by an extended Kalman filter of the arm with all its geometry, from rest or from a spread about it."""
     chain = _chain_arrays(structure)
 
     def predict(par: Parameters, noise: Noise) -> Prediction:
@@ -84,9 +85,12 @@ def extended_kalman(structure: Structure, runs: Runs) -> Predictor:
         for r, p in enumerate(runs.point):
             s = steps[p]
             Q = s.B * noise.process**2 @ s.B.T
+            P = s.filter.P
+            if runs.spread is not None:
+                P = P + np.diag(np.repeat(runs.spread[r] ** 2, len(P) // 2))
             _extended(
                 chain, s.x0, s.u0, s.A, s.B, s.hold, s.rise, s.springs, s.flat, Q, noise.measurement**2,
-                s.filter.P, runs.u[r], runs.y[r], e[r], S[r],
+                P, runs.u[r], runs.y[r], e[r], S[r],
             )
         return gaussian(e[:, runs.skip :], S[:, runs.skip :])
 
@@ -102,7 +106,19 @@ def particle_filter(
     anew where their weights have degenerated, so that the likelihood still jumps a little along parameters: its slope
     is to be taken over steps that change it by more than that (``fit_prediction``, ``guide``). Slopes of the particles
     themselves are no way out: they are those of an arm without feedback, which weights would have to undo.
+
+    How far that reaches: on two joints of the ur10 with 2 x 2000 samples that count, the log-likelihood of 100 particles
+    at the true parameters is that of the extended filter less 80, +-33 over seeds (200: less 51, +-31), and between springs
+    0.1 % apart its change scatters by 35 although the random numbers are the same, for they meet other ancestors; one
+    standard deviation of a spring is worth 0.5. Drawing particles with the next sample in sight would not mend that: what
+    the torque noise of one sample moves is 1e-5 of the variance of the encoder. What would, a Kalman filter in each
+    particle, is the extended filter again on an arm as nearly linear as this.
+
+    Raises:
+        DataError: for runs that begin in motion: next to none of the particles would be near.
     """
+    if runs.spread is not None:
+        raise DataError("runs", "particle_filter", "some that begin in motion", "runs from rest")
     chain = _chain_arrays(structure)
 
     def predict(par: Parameters, noise: Noise) -> Prediction:

@@ -24,18 +24,20 @@ from robot_assets.errors import DataError
 PROMISE = 1e-3  # fall of -2 log L that a step promises at which a fit is done: far below one standard deviation
 LONGEST = 0.7  # step in a log-parameter
 DIFFERENCE = 1e-5  # step of the differences that give derivatives of innovations
+AT_REST = 6.0  # standard deviations of a first sample from rest
 WIDE, WIDEST = 20.0, 0.05  # of a likelihood that jumps: standard deviations of a coordinate by itself, and at most
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Recordings from rest, cut alike.
+    """Recordings cut alike.
 
     Attributes:
         u: (R, T, n) recorded motor torque, N m. y: (R, T, n) motor position, rad.
         point: (R,) index of the operating point of each. q0: (Q, n) rad, motors at rest there.
         skip: leading samples that the criterion leaves out: the predictor settles.
         sample_time: s.
+        spread: (R, 2) standard deviations, rad and rad/s, of the state about rest where each begins. None from rest.
     """
 
     u: np.ndarray
@@ -44,6 +46,7 @@ class Runs:
     q0: np.ndarray
     skip: int
     sample_time: float
+    spread: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -94,9 +97,12 @@ class PredictionFit:
 def runs_of(dataset: Dataset, *, role: str = "identification", amplitude: float | None = None) -> Runs:
     """The multisine segments of a role at one level, whole; the highest level where None.
 
+    Where some begin in motion, as parts of one long recording do, a period at least is skipped: the local predictor
+    begins at rest and needs it to settle.
+
     Raises:
-        DataError: where there are none, their lengths differ, they do not tell where the arm stood, or the torque
-            is not held.
+        DataError: where there are none, their lengths differ, they do not tell where the arm stood, the torque
+            is not held, or a single period begins in motion.
     """
     if dataset.input_hold != "zoh":
         raise DataError("input_hold", dataset.name, dataset.input_hold, '"zoh", which the sampled model takes')
@@ -108,14 +114,33 @@ def runs_of(dataset: Dataset, *, role: str = "identification", amplitude: float 
             raise DataError("samples", s.name, f"{s.n_samples}", f"{first.n_samples}, as in {first.name}")
         if s.q0 is None:
             raise DataError("q0", s.name, "none", "the posture at rest")
-    return Runs(
-        np.stack([s.tau for s in chosen]),
-        np.stack([s.q for s in chosen]),
-        np.repeat(np.arange(len(points)), [len(m) for m in points.values()]),
-        np.stack([m[0].q0 for m in points.values()]),
-        first.transient_periods * first.period,
-        1.0 / dataset.sample_rate,
-    )
+    y, q0 = np.stack([s.q for s in chosen]), np.stack([m[0].q0 for m in points.values()])
+    point = np.repeat(np.arange(len(points)), [len(m) for m in points.values()])
+    skip = first.transient_periods * first.period
+    noise = np.asarray(dataset.robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
+    spread = spread_at_start(y - q0[point][:, None], noise, 1.0 / dataset.sample_rate)
+    if spread is not None:
+        skip = max(skip, first.period)
+        if skip >= y.shape[1]:
+            raise DataError("periods", dataset.name, "a single one that begins in motion", "one to settle and one to count")
+    return Runs(np.stack([s.tau for s in chosen]), y, point, q0, skip, 1.0 / dataset.sample_rate, spread)
+
+
+def spread_at_start(y: np.ndarray, noise: np.ndarray, sample_time: float) -> np.ndarray | None:
+    """(R, 2) spread in rad and rad/s of the states in which runs begin; None where all begin at rest.
+
+    A run begins at rest where its first sample is that within the noise. The state of one that does not is somewhere
+    in its own motion: motors and links are given the rms of the motor that moves most.
+
+    Args:
+        y: (R, T, n) motor positions from rest, rad. noise: (n,) standard deviations of these.
+    """
+    moving = np.any(np.abs(y[:, 0]) > AT_REST * noise, axis=1)
+    if not moving.any():
+        return None
+    size = np.sqrt(np.mean(y**2, axis=1)).max(axis=1)
+    speed = np.sqrt(np.mean(np.diff(y, axis=1) ** 2, axis=1)).max(axis=1) / sample_time
+    return moving[:, None] * np.stack([size, speed], axis=1)
 
 
 def gaussian(e: np.ndarray, S: np.ndarray) -> Prediction:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from ident.estimate import ESTIMATORS, UNSEEN, _sandwich, fit_frf
 from ident.excitation import operating_points
@@ -147,6 +148,22 @@ def test_entries_below_the_noise_do_not_bias_log_fits(arm):
     result = fit(arm, frf, truth, estimator="wlls")
     assert result.residuals < 0.95 * G.size
     assert np.abs(log_error(result, truth))[:6].max() < 0.01
+
+
+def test_weak_entries_do_not_bias_weighted_log_fits(arm):
+    """Entries from a hundredth to thirty times their deviation: the mean error over draws is that of chance.
+
+    Measured entries as weights, and a mask that keeps those that noise has raised, give mean errors of up to three
+    standard deviations.
+    """
+    structure, _, truth, postures = arm
+    G, z = model_of(structure, truth, postures), []
+    for seed in range(16):
+        result = fit(arm, measured(G, postures, np.random.default_rng(seed), floor=0.03), truth, estimator="wlls", search=False)
+        z.append(log_error(result, truth) / np.sqrt(np.diag(result.covariance))[:-1])
+    mean = np.mean(z, axis=0) * np.sqrt(len(z))
+    assert np.sum(mean**2) < chi2.ppf(1 - 1e-3, mean.size)
+    assert 0.8 < np.mean(np.square(z)) < 1.25
 
 
 def test_what_the_band_does_not_show_is_said(arm):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ident.cutting import cut_recording, schedule_plan
 from ident.estimate import fit_frf
 from ident.filters import extended_kalman, particle_filter, stepper
 from ident.frf import FRF
@@ -18,6 +19,7 @@ from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import plan_experiment
+from sim.recording import run_recording
 
 TS = 1e-3
 PERIOD = 1000
@@ -149,6 +151,27 @@ def test_extended_filter_predicts_the_whole_arm_of_another_engine(pair):
     w = np.linalg.inv(np.linalg.cholesky(found.covariance)) @ found.innovations[..., None]
     assert np.mean(w**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / w.size))
     assert found.log_likelihood > plain.log_likelihood + 20
+
+
+def test_runs_that_begin_in_motion_are_predicted_from_there(pair):
+    """The second experiment of one long recording follows the first without a stop."""
+    plan = plan_experiment(
+        pair, Q0[None], points=1, validation_points=0, levels=(1.0,), period=PERIOD, periods=2, transient_periods=0, trajectory=False
+    )
+    schedule = schedule_plan(plan)
+    runs = runs_of(cut_recording(run_recording(schedule, seed=3), schedule))
+    assert runs.skip == PERIOD and runs.spread is not None
+    assert np.all(runs.spread[0] == 0) and np.all(runs.spread[1] > 0)
+    structure, par = build_structure(pair), Parameters.nominal(pair)
+    noise = Noise(np.hypot(1.0, 0.5) * pair.array("tau_std"), pair.array("q_std"))
+    found = extended_kalman(structure, replace(runs, skip=0))(par, noise)
+    w = np.linalg.inv(np.linalg.cholesky(found.covariance)) @ found.innovations[..., None]
+    for part in (slice(0, 20), slice(20, 200), slice(200, None)):
+        few = w[1, part]
+        assert np.mean(few**2) < 1.0 + 5 * np.sqrt(2 / few.size)
+    assert np.mean(w**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / w.size))
+    with pytest.raises(DataError, match="motion"):
+        particle_filter(structure, runs)
 
 
 def test_particle_likelihood_converges_to_the_kalman_one(twomass):
