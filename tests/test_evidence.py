@@ -186,7 +186,7 @@ def test_an_effect_at_its_bounds_is_none(named):
 
 
 def test_a_gear_far_from_its_guess_has_gone_astray(identified):
-    setup, fit = identified[:2]
+    _, setup, fit = identified
     assert not np.any(astray(setup.problem, fit))
     par = fit.model.par
     far = replace(par, damping=par.damping * np.array([1, 1, 1, 100, 1, 1]))
