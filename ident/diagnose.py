@@ -12,7 +12,7 @@ import numpy as np
 from ident.attribute import NOT_COMPUTED, Attribution, attribute, fit_baseline
 from ident.conclude import baseline_values, conclude, named_effects
 from ident.dataset import Dataset
-from ident.extended import Effect, predict
+from ident.extended import Effect, Prediction, predict
 from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import (
     Parameters,
@@ -217,23 +217,29 @@ def diagnose_fully(
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
     problem, cut = setup.problem, workers.late
     say("gain on held-out data")
-    before, after = baseline.model, result.final.model
-    first = predictions(problem, before, baseline.remainders)
+    first = predictions(problem, baseline.model, baseline.remainders)
     affected = affected_joints(problem, baseline, first) if result.detected else ()
-    if setup.held_out:
-        errors, pairs = segment_errors(problem, setup.held_out, before, after)
-        method = "validation segments" if dataset is given else "the end of the only motion, held out"
-        gain = measure_gain(errors, dataset.joints, affected, method, np.random.default_rng(SEED))
-        shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
-    else:
-        gain = leave_one_out(setup, nominal, baseline, result, rigid is not None, affected, workers)
-        shown = problem.groups[:1]
-        pairs = [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
+    method = "validation segments" if dataset is given else "the end of the only motion, held out"
+
+    def tested(found: Attribution) -> HeldOut:
+        return held_out(setup, nominal, baseline, found, rigid is not None, affected, method, workers)
+
+    gain, shown, pairs = tested(result)
+    harm = ()
+    if harmful(gain):
+        names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
+        harm = (
+            f"Taken back: {names}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
+            f" {gain.before:.3g} N m.",
+        )
+        result, rigid = replace(result, rounds=(), final=baseline, unknown=True), None
+        gain, shown, pairs = tested(result)
     say("evidence")
-    last = predictions(problem, after, result.final.remainders)
+    last = predictions(problem, result.final.model, result.final.remainders)
     late = find_link_delays(problem, last)
     separating = separating_experiment(problem, result)
     verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
+    verdict = replace(verdict, notes=(*verdict.notes, *harm))
     if cut:
         note = f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found."
         verdict = replace(verdict, notes=(*verdict.notes, note))
@@ -260,6 +266,42 @@ def diagnose_fully(
             tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
         ),
     )
+
+
+HeldOut = tuple[Gain | None, tuple[Group, ...], list[tuple[Prediction, Prediction]]]
+"""Gain, and the groups that are shown with their predictions before and after."""
+
+
+def held_out(
+    setup: Setup,
+    nominal: Parameters,
+    baseline: Fit,
+    result: Attribution,
+    renewed: bool,
+    affected: Sequence[int],
+    method: str,
+    workers: Workers,
+) -> HeldOut:
+    """What the extended model gains on data that it was not fitted to: held-out segments, or points left out.
+
+    Args:
+        nominal, renewed: as of ``leave_one_out``.
+        affected: joints over which errors are taken.
+        method: how segments are held out, for the verdict.
+    """
+    problem, before, after = setup.problem, baseline.model, result.final.model
+    if setup.held_out:
+        errors, pairs = segment_errors(problem, setup.held_out, before, after)
+        gain = measure_gain(errors, problem.structure.robot.joint_names, affected, method, np.random.default_rng(SEED))
+        return gain, tuple(g for g in setup.held_out if g.segments[0] in errors.segments), pairs
+    gain = leave_one_out(setup, nominal, baseline, result, renewed, affected, workers)
+    shown = problem.groups[:1]
+    return gain, shown, [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
+
+
+def harmful(gain: Gain | None) -> bool:
+    """Whether held-out data are predicted worse with the causes than without, beyond chance."""
+    return gain is not None and gain.ci95 is not None and gain.ci95[1] < 0.0
 
 
 def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:

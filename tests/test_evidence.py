@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from ident.attribute import ABSENT, POINTLESS_NATS, TEMPER, Candidate, astray, explained, occam, pointless, weigh
-from ident.diagnose import diagnose
+from ident.diagnose import diagnose, harmful
 from ident.extended import Effect
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
 from ident.torque_fit import joint_costs, predictions, weighted_cost
+from ident.verdict import Gain
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from tests.conftest import small_plan, through_files
@@ -119,7 +120,6 @@ def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):
 )
 def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise, chi2, refuted):
     from ident.trust import fails_held_out
-    from ident.verdict import Gain
 
     closed = (before - after) / (before - noise)
     gain = Gain(("a",), "RMS", before, after, noise, closed, (closed, closed), "validation segments")
@@ -192,3 +192,9 @@ def test_a_gear_far_from_its_guess_has_gone_astray(identified):
     far = replace(par, damping=par.damping * np.array([1, 1, 1, 100, 1, 1]))
     moved = replace(fit, model=replace(fit.model, par=far))
     assert list(np.flatnonzero(astray(setup.problem, moved))) == [3]
+
+
+@pytest.mark.parametrize("interval, bad", [((-2.0, -0.1), True), ((-1.0, 0.3), False), ((0.8, 1.0), False), (None, False)])
+def test_an_extension_that_surely_harms_is_taken_back(interval, bad):
+    assert harmful(Gain(("a", "b"), "rms", 1.0, 1.5, 0.1, -0.5, interval, "validation segments")) == bad
+    assert not harmful(None)
