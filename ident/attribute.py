@@ -436,7 +436,7 @@ def explore_softly(
             result = last or result
         return last
 
-    fits = workers.map(sharpened, ways, lambda way: f"finalist: {way[0].effect} at {way[0].place}")
+    fits = workers.map_in_time(sharpened, ways, lambda way: f"finalist: {way[0].effect} at {way[0].place}")
     finalists = [(h, r) for (h, _, _), r in zip(ways, fits, strict=True) if r is not None]
     return reweighted(problem, current, sharp), finalists, scores, softly
 
@@ -505,7 +505,7 @@ def explore(
         return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
 
     def begun(chosen: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
-        fits = workers.map(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
+        fits = workers.map_in_time(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
         return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
 
     found = begun(choose(scores))
@@ -628,7 +628,7 @@ def beside_strong(
     chosen = strong_effects(problem, before, scores, likely)
     if not problem.motions_alone:
         chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
-    fits = workers.map(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+    fits = workers.map_in_time(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
     pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)

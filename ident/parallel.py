@@ -110,6 +110,22 @@ class Workers:
         futures = [self.executor.submit(_run_packed, packed, cloudpickle.dumps(told(item))) for item in items]
         return [cloudpickle.loads(future.result()) for future in futures]
 
+    def map_in_time(
+        self, function: Callable[[Item], Result], items: Iterable[Item], label: Callable[[Item], str] | None = None
+    ) -> list[Result | None]:
+        """``map``, with None for items of this process that the deadline comes before."""
+        if self.executor is not None:
+            return list(self.map(function, items, label))
+
+        def run(item: Item) -> Result | None:
+            if self.late:
+                return None
+            if label is not None:
+                self.say(label(item))
+            return function(item)
+
+        return map_threads(run, items)
+
 
 @one_thread_each
 def _run_packed(function: bytes, item: bytes) -> bytes:

@@ -95,3 +95,8 @@ def test_functions_made_on_the_spot_reach_other_processes():
     factor = 3
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         assert Workers(pool).map(lambda x: factor * x, [1, 2], str) == [3, 6]
+
+
+def test_pieces_that_the_deadline_comes_before_are_left_out():
+    assert Workers(deadline=0.0).map_in_time(lambda x: 2 * x, [1, 2], str) == [None, None]
+    assert Workers().map_in_time(lambda x: 2 * x, [1, 2], str) == [2, 4]
