@@ -48,7 +48,7 @@ def test_the_whole_path_on_real_data(bench):
 
 def test_a_map_or_log_that_does_not_fit_is_one_clear_error(tmp_path):
     log = tmp_path / "log.csv"
-    log.write_text("a,b\n1,2\n3,4\n")
+    log.write_text("a,b\n" + "1,2\n3,4\n" * 8)
     text = 'sample_rate = 100.0\n[columns]\ntau_1 = { source = "a", unit = "N m" }\nq_1 = { source = "%s", unit = "%s" }\n'
     for source, unit, found in (("c", "rad", "no c"), ("b", "parsec", "parsec")):
         (tmp_path / "map.toml").write_text(text % (source, unit))
@@ -56,7 +56,7 @@ def test_a_map_or_log_that_does_not_fit_is_one_clear_error(tmp_path):
             convert_logs([log], "twomass", tmp_path / "map.toml")
     (tmp_path / "map.toml").write_text(text % ("b", "deg"))
     data = convert_logs([log], "twomass", tmp_path / "map.toml")
-    assert np.allclose(data.segments[0].q[:, 0], np.deg2rad([2.0, 4.0]))
+    assert np.allclose(data.segments[0].q[:, 0], np.deg2rad([2.0, 4.0] * 8))
 
 
 def test_time_stamps_are_resampled_on_a_uniform_grid(tmp_path):
