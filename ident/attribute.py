@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from ident.extended import Effect, Model, along_record, as_loop, is_along_record
+from ident.extended import Effect, Model, Prediction, along_record, as_loop, is_along_record
 from ident.graybox import Parameters
 from ident.hypotheses import Hypothesis, Parameter, catalogue
 from ident.parallel import Workers
-from ident.screening import Score, hinge_start, screen, signal_scale
+from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import (
     ANNEALING,
     Fit,
@@ -125,6 +125,7 @@ def fit_baseline(
     """
     start = Model(problem.structure, problem.nominal, effects)
     best = first = anneal(problem, start, progress=progress)
+
     def again(par: Parameters) -> Fit:
         """Fitted from other drives."""
         return anneal(
@@ -510,7 +511,7 @@ def explore(
 
     found = begun(choose(scores))
     if rough and left_by(found) > ANSWERED * excess and not workers.late:
-        found += begun(hinges_everywhere(problem, stage, scores))
+        found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
     if not (rough and left_by(found) < ANSWERED * excess):
         last = workers.map(finished, [r for _, r in found])
@@ -578,26 +579,30 @@ def choose(scores: Sequence[Score]) -> list[Score]:
         out.append(score)
         if len(out) == REFITS:
             break
-    near: dict[tuple, Score] = {}
+    hinges = [s for s in out if "hinge" in s.hypothesis.options]
+    taken = {_side(s) for s in hinges}
     for s in scores:
-        if "hinge" in s.hypothesis.options and s.start is not None:
-            near.setdefault((s.hypothesis.key, s.hypothesis.options["before"]), s)
-    taken, best = {id(s) for s in out}, max((s.gain for s in near.values()), default=0.0)
-    if taken & {id(s) for s in near.values()}:
-        out += [s for s in near.values() if id(s) not in taken and s.gain >= NEAR_HINGE * best]
+        if hinges and "hinge" in s.hypothesis.options and s.start is not None and s.gain >= NEAR_HINGE * hinges[0].gain:
+            if _side(s) not in taken:
+                taken.add(_side(s))
+                out.append(s)
     return out
 
 
-def hinges_everywhere(problem: Problem, stage: Fit, scores: Sequence[Score]) -> list[Score]:
+def _side(score: Score) -> tuple[tuple[str, str], bool]:
+    """Where a hinge is."""
+    return score.hypothesis.key, score.hypothesis.options["before"]
+
+
+def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Sequence[Score]) -> list[Score]:
     """A hinge at each place where there may be one, of a resonance within the band.
 
     The gears have taken up the best part of one that is missing: a linear step from there has a wrong sign, or
     answers at another joint.
     """
-    scale = signal_scale(problem, predictions(problem, stage.model, stage.remainders), 0, ())
-    middle = MID_RESONANCE * scale.resonances[-1]
+    middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).resonances[-1]
     hinges = [s for s in scores if "hinge" in s.hypothesis.options]
-    return [replace(s, start=hinge_start(problem, s.hypothesis, middle, MID_RATIO)) for s in hinges]
+    return [replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO)) for s in hinges]
 
 
 def beside_strong(

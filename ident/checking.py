@@ -16,12 +16,11 @@ from ident.channel_checks import (
     stuck_warnings,
     unit_warnings,
 )
-from ident.dataset import Dataset, Segment
+from ident.dataset import CHANNELS, Dataset, Segment
 from ident.records import difference_noise
 from ident.torque_checks import torque_warnings
 from robot_assets.robot import linear_joints
 
-CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")
 CHECKS = (unit_warnings, stuck_warnings, lost_sample_warnings, skew_warnings, excitation_warnings, torque_warnings)
 MOST = 40  # warnings shown
 SHOWN = 12  # segments listed one by one

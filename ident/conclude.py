@@ -26,7 +26,7 @@ from ident.trust import (
     known_probability,
     left_of,
 )
-from ident.verdict import Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
+from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 AXIS_STEP = 1e-6  # of a tilt
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
@@ -87,7 +87,7 @@ def conclude(
     if not seen:
         seen += tuple(Where(dataset.joints[x.joint], "q", "position in steps", 1.0) for x in steps)
         seen += tuple(Where(dataset.joints[x.joint], "q_link", "position that follows the velocity", 1.0) for x in late)
-    verdict = "unknown cause remains" if unknown else "noise floor reached"
+    verdict = UNKNOWN if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)
     if rigid is not None:
         links = inertia_values(rigid) | offset_values(final, covariance)

@@ -10,6 +10,7 @@ import numpy as np
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 
+CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")
 
 @dataclass(frozen=True)
 class Segment:
@@ -55,8 +56,7 @@ class Segment:
 
     def part(self, rows: slice) -> dict[str, np.ndarray]:
         """Time and the channels that there are, some of their samples."""
-        names = ("t", "tau", "q", "qd", "r", "q_ref", "q_link", "temp")
-        return {name: x[rows] for name in names if (x := getattr(self, name)) is not None}
+        return {name: x[rows] for name in ("t", *CHANNELS) if (x := getattr(self, name)) is not None}
 
     @property
     def steady_periods(self) -> int:

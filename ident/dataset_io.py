@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomlkit
 
-from ident.dataset import Dataset, Segment
+from ident.dataset import CHANNELS, Dataset, Segment
 from ident.outputs import take_place
-from ident.segment_file import CHANNELS, read_segment
+from ident.segment_file import read_segment
 from robot_assets.errors import DataError
 from robot_assets.robot import ASSETS, Robot, load_robot
 from robot_assets.values import choice, exists, number, read_toml, show, subtable, tables, text, vector, whole

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.attribute import NOT_COMPUTED, Attribution, attribute, fit_baseline
+from ident.channel_checks import MOVES
 from ident.conclude import baseline_values, conclude, named_effects
 from ident.dataset import Dataset
 from ident.extended import Effect, Prediction, predict
@@ -35,7 +36,7 @@ from ident.rigid import RigidFit, fit_rigid
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, Problem, data_count, fit, predictions
 from ident.trust import LEFT_ERROR, known_probability
-from ident.verdict import Diagnosis, Gain, Verdict
+from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 from robot_assets.errors import DataError
 
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
@@ -43,11 +44,9 @@ MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 SETTLED_BY_INERTIAS = 0.5  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
-MOVES = 3.0  # standard deviation of a position over its noise
 HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
 LEAST_HELD_OUT = 2.0  # s of it
 MAX_SECONDS = 900.0  # of search for causes
-UNKNOWN = "unknown cause remains"
 SEED = 0
 
 
@@ -225,12 +224,12 @@ def diagnose_fully(
         return held_out(setup, nominal, baseline, found, rigid is not None, affected, method, workers)
 
     gain, shown, pairs = tested(result)
-    harm = ()
+    notes: list[str] = []
     if harmful(gain):
         names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
-        harm = (
+        notes.append(
             f"Taken back: {names}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
-            f" {gain.before:.3g} N m.",
+            f" {gain.before:.3g} N m."
         )
         result, rigid = replace(result, rounds=(), final=baseline, unknown=True), None
         gain, shown, pairs = tested(result)
@@ -239,10 +238,9 @@ def diagnose_fully(
     late = find_link_delays(problem, last)
     separating = separating_experiment(problem, result)
     verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
-    verdict = replace(verdict, notes=(*verdict.notes, *harm))
     if cut:
-        note = f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found."
-        verdict = replace(verdict, notes=(*verdict.notes, note))
+        notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
+    verdict = replace(verdict, notes=(*verdict.notes, *notes))
     doubts = mislabelled(given)
     if doubts:
         verdict = withdrawn(verdict, doubts)

@@ -97,17 +97,11 @@ class Workers:
         Args:
             label: what to say of an item when it begins, or when it is handed to the executor.
         """
-
-        def told(item: Item) -> Item:
-            if label is not None:
-                self.say(label(item))
-            return item
-
         if self.executor is None:
-            return map_threads(lambda item: function(told(item)), items)
+            return map_threads(lambda item: function(self._told(item, label)), items)
         # Effects hold functions made on the spot, which the pickle of the standard library cannot send.
         packed = cloudpickle.dumps(function)
-        futures = [self.executor.submit(_run_packed, packed, cloudpickle.dumps(told(item))) for item in items]
+        futures = [self.executor.submit(_run_packed, packed, cloudpickle.dumps(self._told(item, label))) for item in items]
         return [cloudpickle.loads(future.result()) for future in futures]
 
     def map_in_time(
@@ -116,15 +110,12 @@ class Workers:
         """``map``, with None for items of this process that the deadline comes before."""
         if self.executor is not None:
             return list(self.map(function, items, label))
+        return map_threads(lambda item: None if self.late else function(self._told(item, label)), items)
 
-        def run(item: Item) -> Result | None:
-            if self.late:
-                return None
-            if label is not None:
-                self.say(label(item))
-            return function(item)
-
-        return map_threads(run, items)
+    def _told(self, item: Item, label: Callable[[Item], str] | None) -> Item:
+        if label is not None:
+            self.say(label(item))
+        return item
 
 
 @one_thread_each

@@ -14,7 +14,6 @@ import numpy as np
 
 from ident.extended import Prediction
 from ident.hypotheses import Hypothesis, SignalScale
-from ident.hypotheses.structure import hinge_inertia
 from ident.inverse import Motion
 from ident.parallel import map_threads
 from ident.torque_fit import Fit, Problem, as_real, jacobian, observe_columns, residual
@@ -234,21 +233,9 @@ def _line_sums(parts: Sequence[tuple[_Field, np.ndarray]]) -> _Sums:
 
 def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | None:
     if "hinge" in h.options:
-        return None if c[0] < 0.05 else hinge_start(problem, h, *shape, softer=float(np.clip(c[0], 0.2, 3.0)))
+        return None if c[0] < 0.05 else h.options["hinge"](problem.structure, problem.groups[0], *shape, softer=float(np.clip(c[0], 0.2, 3.0)))
     p = start(c)
     return None if p is None or not np.all(np.isfinite(p)) else np.asarray(p, float)
-
-
-def hinge_start(problem: Problem, h: Hypothesis, frequency: float, ratio: float, softer: float = 1.0) -> np.ndarray:
-    """Parameters of a hinge with its own resonance at ``frequency`` (Hz), of that damping ``ratio``.
-
-    Args:
-        softer: by which its stiffness is divided.
-    """
-    straight = np.zeros(len(h.parameters) - 2)
-    own = hinge_inertia(problem.structure, h.options["hinge"]([1e12, 1.0, *straight]), problem.groups[0])
-    stiffness = own * (2 * np.pi * frequency) ** 2 / softer
-    return np.array([stiffness, 2 * ratio * np.sqrt(own * stiffness), *straight])
 
 
 def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:

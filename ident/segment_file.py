@@ -9,11 +9,11 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from ident.dataset import CHANNELS
 from ident.unpacked import check_size
 from robot_assets.errors import DataError
 from robot_assets.values import exists
 
-CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")
 REQUIRED = ("tau", "q")
 TIME_TOLERANCE = 0.05  # of a sample period, on every step of `t`
 LARGEST = 1e12  # SI; anything above is no angle, torque or time

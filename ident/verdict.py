@@ -16,6 +16,7 @@ from ident.excitation import Plan
 from robot_assets.robot import Robot
 
 SCHEMA = "simgap-verdict/1"
+UNKNOWN = "unknown cause remains"
 
 
 @dataclass(frozen=True)

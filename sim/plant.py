@@ -243,19 +243,20 @@ def _add_chain(spec: mujoco.MjSpec, robot: Robot, hinges: Sequence[Elasticity]) 
                     R = R * Rotation.from_rotvec(axis / np.linalg.norm(axis) * value)
             part = body.add_body(name=f"body:{child}", pos=p, quat=_quat(R))
             if name in robot.joint_names:
+                _add_hinges(part, [h for h in hinges if h.joint == name and h.before])
                 slide = kind == "prismatic"
                 part.add_joint(
                     name=f"link:{name}",
                     axis=axis,
                     type=mujoco.mjtJoint.mjJNT_SLIDE if slide else mujoco.mjtJoint.mjJNT_HINGE,
                 )
-                _add_hinges(part, name, hinges)
+                _add_hinges(part, [h for h in hinges if h.joint == name and not h.before])
             add(part, child)
 
     bottom = spec.worldbody
     if any(h.joint == "base" for h in hinges):
         bottom = spec.worldbody.add_body(name="base")
-        _add_hinges(bottom, "base", hinges)
+        _add_hinges(bottom, [h for h in hinges if h.joint == "base"])
     for link in sorted(base):
         if bottom is spec.worldbody:
             part = bottom.add_body(name=f"body:{link}")
@@ -264,15 +265,14 @@ def _add_chain(spec: mujoco.MjSpec, robot: Robot, hinges: Sequence[Elasticity]) 
         add(part, link)
 
 
-def _add_hinges(body: mujoco.MjsBody, joint: str, hinges: Sequence[Elasticity]) -> None:
+def _add_hinges(body: mujoco.MjsBody, hinges: Sequence[Elasticity]) -> None:
     for h in hinges:
-        if h.joint == joint:
-            body.add_joint(
-                name=f"hinge:{h.name}",
-                axis=list(h.axis),
-                stiffness=[h.stiffness, 0, 0],
-                damping=[h.damping, 0, 0],
-            )
+        body.add_joint(
+            name=f"hinge:{h.name}",
+            axis=list(h.axis),
+            stiffness=[h.stiffness, 0, 0],
+            damping=[h.damping, 0, 0],
+        )
 
 
 def _set_inertia(body: mujoco.MjsBody, link: ET.Element) -> None:

@@ -1,6 +1,7 @@
 """The arms that come with the project: their figures, and that both models describe the same bodies."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -10,7 +11,7 @@ import scipy.linalg
 
 from ident.excitation import operating_points
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, stiffness_diagonal
-from robot_assets.robot import load_robot
+from robot_assets.robot import Elasticity, load_robot
 from sim import run_experiment
 from sim.plant import build_plant, rest
 from tests.conftest import small_plan
@@ -146,3 +147,20 @@ def test_plant_and_gray_box_sag_alike(name):
         assert np.allclose(x[plant.link], q[structure.driven], atol=1e-8)
         assert np.allclose(x[plant.hinges], q[structure.elastic], atol=1e-8)
         assert np.allclose(hold, par.stiffness * (q_m - q[structure.driven]), rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_a_hinge_lies_on_the_same_side_of_its_joint_in_plant_and_model(before):
+    robot = load_robot("ur10")
+    robot = replace(robot, elasticities=(Elasticity("h", "elbow_joint", (1.0, 0.0, 0.5), 1e4, 10.0, before),))
+    q = np.array([0.2, -1.2, 0.9, 0.1, 0.5, 0.3])
+    plant, structure = build_plant(robot), build_structure(robot)
+    data, M = mujoco.MjData(plant.model), np.zeros((plant.model.nv, plant.model.nv))
+    data.qpos[plant.link] = q
+    mujoco.mj_forward(plant.model, data)
+    mujoco.mj_fullM(plant.model, data, M)
+    x = np.zeros(structure.n_coordinates)
+    x[structure.driven] = q
+    own = np.r_[structure.driven, structure.elastic]
+    there = np.r_[plant.link, plant.hinges].astype(int)
+    assert M[np.ix_(there, there)] == pytest.approx(linearise(structure, x).M[np.ix_(own, own)], abs=1e-5)

@@ -64,13 +64,14 @@ HINGES = [
     cause("base_elasticity", "base", stiffness=5e5, damping=500.0, axis_x=1.0, axis_y=0.0, axis_z=0.0),
     cause("base_elasticity", "base", stiffness=4e5, damping=400.0, axis_x=0.0, axis_y=1.0, axis_z=0.0),
 ]
+BEFORE = cause("transverse_elasticity", "elbow_joint", stiffness=2e4, damping=20.0, axis_x=0.6, axis_y=0.0, axis_z=0.8, before=1.0)
 
 
 @pytest.mark.parametrize(
     ("robot_name", "causes"),
     # A hinge along another with no mass between them has no inertia of its own: the irb gets one at joint_5 alone.
-    [("ur10", []), ("ur10", HINGES), ("irb", []), ("irb", [replace(HINGES[0], joint="joint_5")])],
-    ids=["ur10", "ur10-hinges", "irb", "irb-hinge"],
+    [("ur10", []), ("ur10", HINGES), ("ur10", [BEFORE]), ("irb", []), ("irb", [replace(HINGES[0], joint="joint_5")])],
+    ids=["ur10", "ur10-hinges", "ur10-hinge-before", "irb", "irb-hinge"],
 )
 def test_the_exported_arm_linearises_to_the_matrices_of_the_model(robot_name, causes):
     """d(acceleration)/d(position, velocity, drive) by central differences against the gray-box."""
@@ -78,7 +79,7 @@ def test_the_exported_arm_linearises_to_the_matrices_of_the_model(robot_name, ca
     model = mujoco.MjModel.from_xml_string(_xml(robot, causes))
     values = [{k: v.value for k, v in c.parameters.items()} for c in causes]
     hinges = tuple(
-        Elasticity(f"h{i}", c.joint, tuple(v[f"axis_{a}"] for a in "xyz"), v["stiffness"], v["damping"])
+        Elasticity(f"h{i}", c.joint, tuple(v[f"axis_{a}"] for a in "xyz"), v["stiffness"], v["damping"], "before" in v)
         for i, (c, v) in enumerate(zip(causes, values, strict=True))
     )
     structure, par = apply_change(build_structure(robot), Parameters.nominal(robot), Change(elasticities=hinges))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
@@ -90,21 +92,6 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
     )
 
 
-def constant_torque(joint: int, place: str) -> Hypothesis:
-    """Decoy: a constant error of the recorded torque, which the catalogue lacks and a spring with a far rest would take."""
-    return Hypothesis(
-        "unknown:constant_torque",
-        place,
-        joint,
-        "motor",
-        (Parameter("offset", "N m", -1e7, 1e7),),
-        _constant,
-        lambda scale: [()],
-        lambda motion, j, k, shape: Screen((np.ones_like(motion.q(j)),), lambda c: np.array([c[0]]), ()),
-        "The recorded torque of {joint} is off by a constant.",
-    )
-
-
 def torque_offset(joint: int, place: str) -> Hypothesis:
     """A constant error of the recorded torque: no effect of the catalogue, but of every torque sensor."""
     return Hypothesis(
@@ -113,13 +100,14 @@ def torque_offset(joint: int, place: str) -> Hypothesis:
         joint,
         "motor",
         (Parameter("offset", "N m", -1e7, 1e7),),
-        _constant,
+        lambda p, motion, j, k: p[0] * np.ones_like(motion.q(j)),
         lambda scale: [()],
-        None,
+        lambda motion, j, k, shape: Screen((np.ones_like(motion.q(j)),), lambda c: np.array([c[0]]), ()),
         "The recorded torque of {joint} is off by {offset:.3g} N m.",
         options={"baseline": True},
     )
 
 
-def _constant(p: np.ndarray, motion: Motion, j: int, k: float) -> np.ndarray:
-    return p[0] * np.ones_like(motion.q(j))
+def constant_torque(joint: int, place: str) -> Hypothesis:
+    """Decoy: such an error where it is no part of the baseline; a spring with a far rest would take it."""
+    return replace(torque_offset(joint, place), effect="unknown:constant_torque", options={})

@@ -297,13 +297,15 @@ def compliance(
         x, y, z = (float(v) for v in axis(p))
         return Elasticity(name, place, (x, y, z), float(p[0]), float(p[1]), before)
 
-    def responses(structure, par, plane, group, solution, shape):
-        frequency, ratio = shape
+    def at(structure: Structure, group: Group, frequency: float, ratio: float, softer: float = 1.0) -> np.ndarray:
+        """Parameters with its own resonance at ``frequency`` (Hz), of that damping ``ratio``, its stiffness divided by ``softer``."""
         straight = np.zeros(len(tilts))
-        own = hinge_inertia(structure, hinge([1e12, 1.0, *straight]), group)
-        stiffness = own * (2 * np.pi * frequency) ** 2
-        damping = 2 * ratio * np.sqrt(own * stiffness)
-        wide, wide_par = apply_change(structure, par, Change(elasticities=(hinge([stiffness, damping, *straight]),)))
+        own = hinge_inertia(structure, hinge([STIFFEST, 1.0, *straight]), group)
+        stiffness = own * (2 * np.pi * frequency) ** 2 / softer
+        return np.array([stiffness, 2 * ratio * np.sqrt(own * stiffness), *straight])
+
+    def responses(structure, par, plane, group, solution, shape):
+        wide, wide_par = apply_change(structure, par, Change(elasticities=(hinge(at(structure, group, *shape)),)))
         lin = linearise(wide, equilibrium(wide, wide_par, group.posture))
         Z, _, _ = impedance(wide, wide_par, lin, plane.s)
         unit = np.matmul(Z - plane.Z, solution.Q[..., None])[..., 0]
@@ -332,7 +334,7 @@ def compliance(
         options={
             "change": lambda p: Change(elasticities=(hinge(p),)),
             "responses": responses,
-            "hinge": hinge,
+            "hinge": at,
             "axis": axis,
             "before": before,
             "trivial": lambda p: p[0] > 0.1 * STIFFEST,
