@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from robot_assets.robot import Robot
@@ -82,7 +83,19 @@ class RateFriction:
         return lambda x: Torque(j, -self.coefficient * np.cbrt(x.v[:, j]) * np.minimum(np.abs(x.v[:, j]) / 1e-3, 1.0))
 
 
-KINDS = ("drag", "posture", "neighbour", "dead zone", "cube root")
+@dataclass(frozen=True)
+class LinkFriction:
+    """Viscous friction of the link, behind the gear."""
+
+    place: str
+    coefficient: float
+    name = "outside:link_friction"
+
+    def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
+        spec.joint(f"link:{self.place}").damping = [self.coefficient, 0, 0]
+
+
+KINDS = ("drag", "posture", "neighbour", "dead zone", "cube root", "link friction")
 
 
 def draw_outside(rng: np.random.Generator, robot: Robot, strength: float) -> object:
@@ -99,4 +112,6 @@ def draw_outside(rng: np.random.Generator, robot: Robot, strength: float) -> obj
         return NeighbourDrag(joint.name, torque / (0.05 * joint.velocity_limit))
     if kind == "dead zone":
         return DriveDeadZone(joint.name, torque)
+    if kind == "link friction":
+        return LinkFriction(joint.name, torque / (0.05 * joint.velocity_limit))
     return RateFriction(joint.name, torque / np.cbrt(0.05 * joint.velocity_limit))

@@ -196,14 +196,13 @@ def attribute(
         fall = (before.cost - best.fit.cost) / found.scale
         if fall < MIN_EVIDENCE or found.explained < MIN_SHARE:
             break
-        if best.hypothesis.decoy:
-            unknown = True
-            rounds.append(found)
-            break
         rounds.append(found)
         count += 1
+        unknown = unknown or best.hypothesis.decoy
+        if best.hypothesis.decoy and not best.hypothesis.options.get("baseline"):
+            break
         current = polish(problem, best.fit)
-        if current.chi2_per_dof > FAINT:
+        if current.chi2_per_dof > FAINT and not best.hypothesis.decoy:
             current, more = companions(problem, current, best, hypotheses)
             rounds += more
         taken = {e.hypothesis.key for e in current.model.effects}

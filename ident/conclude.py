@@ -89,10 +89,9 @@ def conclude(
         seen += tuple(Where(dataset.joints[x.joint], "q_link", "position that follows the velocity", 1.0) for x in late)
     verdict = UNKNOWN if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)
-    if rigid is not None:
-        links = inertia_values(rigid) | offset_values(final, covariance)
-        values |= links
-        undetermined += tuple(k for k, v in links.items() if not v.std < UNDETERMINED * abs(v.value))
+    others = extended_baseline(final, covariance) | ({} if rigid is None else inertia_values(rigid))
+    values |= others
+    undetermined += tuple(k for k, v in others.items() if not v.std < UNDETERMINED * abs(v.value))
     description = describe(problem, final, last) if unknown else None
     return Verdict(
         dataset=dataset.name,
@@ -113,6 +112,7 @@ def conclude(
         residual_description=description,
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
+            *(nameless_note(e) for e in final.model.effects if e.hypothesis.decoy),
             *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
         ),
     )
@@ -123,12 +123,13 @@ def named_effects(final: Fit) -> tuple[Effect, ...]:
     return tuple(e for e in final.model.effects if not e.hypothesis.options.get("baseline"))
 
 
-def offset_values(final: Fit, covariance: np.ndarray) -> dict[str, Value]:
-    """Offsets of the torque records, N m."""
+def extended_baseline(final: Fit, covariance: np.ndarray) -> dict[str, Value]:
+    """What the baseline holds beyond the drives: offsets of the torque records, friction of links; each of one parameter."""
     return {
-        f"torque_offset.{e.hypothesis.place}": reported_parameters(e, final, covariance)["offset"]
+        f"{e.hypothesis.options['baseline']}.{e.hypothesis.place}": value
         for e in final.model.effects
         if e.hypothesis.options.get("baseline")
+        for value in reported_parameters(e, final, covariance).values()
     }
 
 
@@ -142,6 +143,12 @@ def inertia_values(rigid: RigidFit) -> dict[str, Value]:
             name = f"{kind}.{body}"
             out[name] = Value(float(v), float(s), parameter_unit(name))
     return out
+
+
+def nameless_note(effect: Effect) -> str:
+    """What a model was extended by that is no effect of the catalogue, in a sentence."""
+    h = effect.hypothesis
+    return h.sentence.format(joint=h.place, **{q.name: v for q, v in zip(h.parameters, effect.p, strict=True)})
 
 
 def record_note(effect: Effect) -> str:

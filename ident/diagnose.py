@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.attribute import NOT_COMPUTED, Attribution, attribute, fit_baseline
 from ident.channel_checks import MOVES
-from ident.conclude import baseline_values, conclude, named_effects
+from ident.conclude import conclude, named_effects
 from ident.dataset import Dataset
 from ident.extended import Effect, Prediction, predict
 from ident.gain import Errors, measure_gain, segment_errors
@@ -255,7 +255,7 @@ def diagnose_fully(
             for i, effect in enumerate(named_effects(result.final))
         ),
         traces=torque_traces(dataset, shown, pairs),
-        parameters={k: v.value for k, v in baseline_values(result.final)[0].items()},
+        parameters={k: v.value for k, v in verdict.baseline.items()},
         seconds=time.perf_counter() - began,
         next_plan=separating.plan if separating else None,
         inertias=problem.structure.inertias,

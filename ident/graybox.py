@@ -4,11 +4,11 @@ With motor angles ``q_m`` (n) and link coordinates ``q_a`` (N >= n: the driven j
 elastic hinge that no motor turns),
 
     J q_m'' + f q_m' + T^T tau_s            = u
-    M(q_a) q_a'' + c(q_a, q_a') + g(q_a)    = S tau_s - E (K_e q_e + D_e q_e')
-    tau_s = K (T q_m - S^T q_a) + D (T q_m' - S^T q_a')
+    M(q_a) q_a'' + c(q_a, q_a') + g(q_a)    = S (tau_s - b q_d') - E (K_e q_e + D_e q_e')
+    tau_s = K (T q_m - S^T q_a) + D (T q_m' - S^T q_a'),    q_d = S^T q_a
 
 (Moberg, Oehr and Gunnarsson 2014; Spong 1987 for N = n). ``T`` is the identity unless the gears
-couple joints. All drive figures are referred to the link side of the gear.
+couple joints, and ``b`` is zero unless the links have friction of their own. All drive figures are referred to the link side of the gear.
 """
 
 from __future__ import annotations
@@ -99,6 +99,7 @@ class Parameters:
         timing: common delay of the torque channel against the position channel that the sampling
             model does not know of, s (a fraction of a sample).
         coupling: (n, n) T of the module docstring.
+        link_viscous: (n,) viscous friction of the driven links, b of the module docstring, N m s/rad.
     """
 
     stiffness: np.ndarray
@@ -109,6 +110,7 @@ class Parameters:
     elastic_damping: np.ndarray
     timing: float
     coupling: np.ndarray
+    link_viscous: np.ndarray
 
     @classmethod
     def nominal(cls, robot: Robot) -> Parameters:
@@ -122,6 +124,7 @@ class Parameters:
             elastic_damping=np.array([e.damping for e in robot.elasticities], float),
             timing=0.0,
             coupling=np.eye(robot.n),
+            link_viscous=np.zeros(robot.n),
         )
 
     def to_log(self) -> np.ndarray:
@@ -171,7 +174,7 @@ INERTIAL = (
 
 
 def parameter_unit(name: str) -> str:
-    """SI unit of a parameter named by ``parameter_names``, of one of ``INERTIAL``, or of an offset of the torque."""
+    """SI unit of a parameter named by ``parameter_names``, of one of ``INERTIAL``, or of what the baseline may hold beside them."""
     kind = name.split(".")[0]
     if kind in INERTIAL:
         return "kg" if kind == "mass" else "kg m" if kind.startswith("first") else "kg m2"
@@ -181,6 +184,7 @@ def parameter_unit(name: str) -> str:
         "motor_inertia": "kg m2",
         "viscous_friction": "N m s/rad",
         "torque_offset": "N m",
+        "link_friction": "N m s/rad",
     }[kind]
 
 
@@ -317,9 +321,9 @@ def stiffness_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
 
 
 def damping_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
-    """(N,) spring damping of each link coordinate, N m s/rad."""
+    """(N,) damping of each link coordinate with motors held, N m s/rad: its spring's and its own."""
     out = np.zeros(structure.n_coordinates)
-    out[structure.driven] = par.damping
+    out[structure.driven] = par.damping + par.link_viscous
     out[structure.elastic] = par.elastic_damping
     return out
 

@@ -81,3 +81,36 @@ def test_friction_of_every_joint_counts_once(ur10, tmp_path):
     for joint, torque in truth.items():
         assert found[joint].parameters["torque"].value == pytest.approx(torque, rel=0.15)
     assert verdict.gain.gap_closed > 0.9
+
+
+def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
+    """The catalogue lacks it, but a model with it is measured and written."""
+    from dataclasses import dataclass
+
+    import mujoco
+
+    from ident.diagnose import diagnose_fully
+    from ident.show.export import write_mjcf
+
+    coefficient = 60.0
+
+    @dataclass(frozen=True)
+    class LinkFriction:
+        place: str
+
+        def edit(self, spec, robot, drives):
+            spec.joint(f"link:{self.place}").damping = [coefficient, 0, 0]
+
+    drives = draw_drives(np.random.default_rng(5), ur10)
+    data = run_experiment(small_plan(ur10, 5, points=1, levels=(1.0,)), [LinkFriction("elbow_joint")], seed=5, drives=drives)
+    result = diagnose_fully(through_files(data, tmp_path))
+    verdict = result.verdict
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    assert all(c.probability <= 0.5 for c in verdict.causes)
+    assert verdict.baseline["link_friction.elbow_joint"].value == pytest.approx(coefficient, rel=0.02)
+    assert any("on the link of elbow_joint" in note for note in verdict.notes)
+    assert verdict.gain.gap_closed > 0.98
+    write_mjcf(result, tmp_path / "model.xml")
+    arm = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    damping = np.ravel(arm.dof_damping[arm.joint("link:elbow_joint").dofadr[0]])[0]
+    assert damping == pytest.approx(coefficient, rel=0.02)

@@ -48,6 +48,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         out += [make(j, name) for make in PER_JOINT]
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.position_friction(j, name))
+        out.append(structure.link_friction(j, name))
         if offsets:
             out.append(sensing.constant_torque(j, name))
         if robot.joints[j].gear_ratio != 1.0:

@@ -106,6 +106,7 @@ class Hypothesis:
             place of one with parameters ``old`` at the same joint. ``essential`` names the parameter without
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm
             may have several steady motions with it. ``nats``: log odds before the data, 0 where there is no reason.
+            ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
     """
 
     effect: str

@@ -104,7 +104,7 @@ def torque_offset(joint: int, place: str) -> Hypothesis:
         lambda scale: [()],
         lambda motion, j, k, shape: Screen((np.ones_like(motion.q(j)),), lambda c: np.array([c[0]]), ()),
         "The recorded torque of {joint} is off by {offset:.3g} N m.",
-        options={"baseline": True},
+        options={"baseline": "torque_offset"},
     )
 
 

@@ -51,6 +51,7 @@ class Change:
     loads: tuple[tuple[str, pin.Inertia], ...] = ()
     links: tuple[tuple[str, LinkChange], ...] = ()
     coupling: tuple[tuple[int, int, float], ...] = ()
+    link_viscous: tuple[tuple[int, float], ...] = ()
 
     def __add__(self, other: Change) -> Change:
         return Change(
@@ -58,6 +59,7 @@ class Change:
             self.loads + other.loads,
             self.links + other.links,
             self.coupling + other.coupling,
+            self.link_viscous + other.link_viscous,
         )
 
 
@@ -79,11 +81,15 @@ def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple
     coupling = par.coupling.copy()
     for row, column, ratio in change.coupling:
         coupling[row, column] += ratio
+    link_viscous = par.link_viscous.copy()
+    for joint, coefficient in change.link_viscous:
+        link_viscous[joint] += coefficient
     stiffness = [e.stiffness for e in change.elasticities]
     damping = [e.damping for e in change.elasticities]
     par = replace(
         par,
         coupling=coupling,
+        link_viscous=link_viscous,
         elastic_stiffness=np.concatenate([par.elastic_stiffness, stiffness]),
         elastic_damping=np.concatenate([par.elastic_damping, damping]),
     )
@@ -273,6 +279,37 @@ def joint_coupling(source: int, target: int, place: str) -> Hypothesis:
             "change": lambda p: Change(coupling=((target, source, float(p[0])),)),
             "responses": responses,
             "start": lambda c: np.array([np.clip(c[0], -1.5, 1.5)]),
+        },
+    )
+
+
+def link_friction(joint: int, place: str) -> Hypothesis:
+    """Decoy: viscous friction of the link, behind the gear, which the catalogue lacks.
+
+    It damps the anti-resonance of the motor, as no damper of the gear does. A model that needs it is extended by it.
+    """
+
+    def responses(structure, par, plane, group, solution, shape):
+        c = structure.driven[joint]
+        rate = plane.s * solution.Q_a[..., c]
+        return [plane.record[:, None] * plane.link_gain[:, :, c] * rate[..., None]]
+
+    return Hypothesis(
+        "unknown:link_friction",
+        place,
+        joint,
+        "model",
+        (Parameter("coefficient", "N m s/rad", 1e-9, 1e7, log=True, step=1e-3),),
+        None,
+        lambda scale: [()],
+        None,
+        "Viscous friction of {coefficient:.3g} N m s/rad on the link of {joint}, behind its gear, is part of the extended"
+        " model: it explains most of the discrepancy, and the catalogue has no name for it.",
+        options={
+            "baseline": "link_friction",
+            "change": lambda p: Change(link_viscous=((joint, float(p[0])),)),
+            "responses": responses,
+            "start": lambda c: np.array([c[0]]) if c[0] > 0 else None,
         },
     )
 

@@ -83,7 +83,7 @@ def build_mjcf(
     friction are exact under the time step and the integrator of the file.
 
     Args:
-        parameters: by the names of ``ident.graybox.parameter_names``.
+        parameters: by the names of ``ident.graybox.parameter_names``, and ``link_friction.<joint>`` where links have some.
         inertias: of bodies by joint of the description, instead of those of the description.
     """
     hinges = tuple(
@@ -109,6 +109,7 @@ def build_mjcf(
     _add_bodies(spec, structure.model, springs)
     for joint in robot.joints:
         _add_motor(spec, joint.name, parameters)
+        spec.joint(f"link:{joint.name}").damping = [parameters.get(f"link_friction.{joint.name}", 0.0), 0, 0]
     for i, cause in enumerate(causes):
         _note_effect(spec, i, cause)
         if cause.joint in robot.joint_names:
