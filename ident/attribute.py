@@ -27,6 +27,7 @@ from ident.torque_fit import (
     Weights,
     anneal,
     fit,
+    inverse,
     joint_costs,
     make_weights,
     predictions,
@@ -50,6 +51,7 @@ SETTLED = 0.05  # share of the excess up to which what is left needs no second s
 HOPEFUL = 5  # candidates fitted further after the first steps
 AS_GOOD = 0.8  # cost of a loop over that along the record, below which it is the loop that is right
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
+UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
@@ -62,6 +64,7 @@ KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is
 ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
 MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
+STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
 POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found absent
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
@@ -206,8 +209,34 @@ def attribute(
             current, more = companions(problem, current, best, hypotheses)
             rounds += more
         taken = {e.hypothesis.key for e in current.model.effects}
+        current = pruned(problem, current)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken)
-    return Attribution(baseline, detected, p_value, tuple(rounds), current, unknown)
+    left = {e.hypothesis.key for e in current.model.effects}
+    kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
+    return Attribution(baseline, detected, p_value, kept, current, unknown)
+
+
+def pruned(problem: Problem, current: Fit) -> Fit:
+    """The model without effects of which nothing is left.
+
+    One that stood for a part of a cause as long as that had no name is not needed beside it; and one that won only since
+    the drives found a better place in its company says nothing: that place is the baseline's then.
+    """
+    std = dict(zip(current.names, np.sqrt(np.maximum(np.diag(current.covariance()), 0.0)), strict=True))
+
+    def nothing(effect: Effect) -> bool:
+        h = effect.hypothesis
+        known = [std[f"{h.effect}@{h.place}:{q.name}"] for q in h.parameters]
+        values = zip(h.parameters, effect.p, known, strict=True)
+        return all(s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in values if not q.nuisance and q.null is None)
+
+    effects = current.model.effects
+    needed = tuple(e for e in effects if e.hypothesis.options.get("baseline") or not nothing(e))
+    if len(needed) == len(effects):
+        return current
+    other = polish(problem, replace(current, model=replace(current.model, effects=needed)))
+    scale = max(1.0, current.cost / current.count)
+    return other if other.cost - current.cost < MIN_EVIDENCE * scale else current
 
 
 def settled(current: Fit) -> bool:
@@ -254,12 +283,44 @@ def companions(
     keys = {s.hypothesis.key for s in kept} | {e.hypothesis.key for e in current.model.effects}
     effects = tuple(e for e in found.model.effects if e.hypothesis.key in keys)
     last = polish(problem, replace(found, model=replace(found.model, effects=effects)))
+    before = {e.hypothesis.key for e in current.model.effects}
+    last = plainer(problem, last, hypotheses, before)
     scale = max(1.0, last.cost / last.count)
     joined = reweighted(problem, last, current.weights)
+    by_joint = {s.hypothesis.joint: s for s in kept}
     rounds = [
-        Round(current, (Candidate(s.hypothesis, joined, 0.0, winner.probability),), (s,), scale, 1.0) for s in kept
+        Round(current, (Candidate(e.hypothesis, joined, 0.0, winner.probability),), (by_joint[e.hypothesis.joint],), scale, 1.0)
+        for e in last.model.effects
+        if e.hypothesis.key not in before
     ]
     return last, rounds
+
+
+def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kept: set[tuple[str, str]]) -> Fit:
+    """The model with the special case in place of effects of which the data do not show what sets them apart from it.
+
+    Args:
+        kept: keys of effects that stay as they are.
+    """
+    known = {h.key: h for h in hypotheses}
+    std = dict(zip(result.names, np.sqrt(np.maximum(np.diag(result.covariance()), 0.0)), strict=True))
+
+    def plain(effect: Effect) -> Effect:
+        h = effect.hypothesis
+        special = known.get((h.options.get("absorbs", ""), h.place))
+        if h.key in kept or special is None or "apart" not in h.options:
+            return effect
+        if std[f"{h.effect}@{h.place}:{h.options['apart']}"] < UNTOLD:
+            return effect
+        return Effect(special, clip_to_bounds(special, h.options["special"](effect.p)))
+
+    effects = tuple(plain(e) for e in result.model.effects)
+    swapped = sum(a is not b for a, b in zip(effects, result.model.effects, strict=True))
+    if not swapped:
+        return result
+    other = polish(problem, replace(result, model=replace(result.model, effects=effects)))
+    scale = max(1.0, result.cost / result.count)
+    return other if other.cost - result.cost < swapped * MIN_EVIDENCE * scale else result
 
 
 def explained(before: Fit, after: Fit) -> float:
@@ -509,7 +570,7 @@ def explore(
         return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
 
     found = begun(choose(scores))
-    if rough and left_by(found) > ANSWERED * excess and not workers.late:
+    if rough and not problem.motions_alone and left_by(found) > ANSWERED * excess and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
     if not (rough and left_by(found) < ANSWERED * excess):
@@ -732,7 +793,7 @@ def occam(candidate: Candidate, temper: float) -> float:
     H = candidate.fit.information
     x = np.array([q.to_internal(v) for q, v in zip(ps, effect.p, strict=True)])
     nulls = np.array([np.nan if q.null is None else q.to_internal(q.null) for q in ps])
-    std = np.sqrt(temper * np.diag(_inverse(H))[-len(ps) :])
+    std = np.sqrt(temper * np.diag(inverse(H, STEADY))[-len(ps) :])
     absent = np.abs(x - nulls) < ABSENT * std
     keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
     count = int(np.sum(~absent))
@@ -741,7 +802,7 @@ def occam(candidate: Candidate, temper: float) -> float:
     nats = POINTLESS_NATS * (essential or pointless(effect))
     if count == 0:
         return -nats
-    own = np.linalg.inv(_inverse(H[np.ix_(keep, keep)])[-count:, -count:])
+    own = np.linalg.inv(inverse(H[np.ix_(keep, keep)], STEADY)[-count:, -count:])
     amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in ("sine", "cosine"))) if _wave(ps) else 0.0
     spread = np.array(
         [q.expected_spread(amplitude if q.name in ("sine", "cosine") else v) for q, v in zip(ps, effect.p, strict=True)]
@@ -763,8 +824,3 @@ def pointless(effect: Effect) -> bool:
 def _wave(parameters: Sequence[Parameter]) -> bool:
     return {"sine", "cosine"} <= {q.name for q in parameters}
 
-
-def _inverse(H: np.ndarray) -> np.ndarray:
-    """Inverse of an information matrix, steadied where coordinates are not determined."""
-    size = np.sqrt(np.maximum(np.diag(H), 1e-30))
-    return np.linalg.inv(H / np.outer(size, size) + 1e-9 * np.eye(len(H))) / np.outer(size, size)

@@ -209,10 +209,14 @@ def diagnose_fully(
     workers = Workers(executor, progress, time.monotonic() + max_seconds)
     say = workers.say
     given, dataset = dataset, with_held_out(dataset)
+    doubts = mislabelled(given)
+    if doubts:
+        say("the recording looks mislabelled: no causes are sought")
+        max_causes = 0
     setup, baseline = identify(dataset, progress=say)
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     nominal, rigid = setup.problem.nominal, None
-    if unresolved(result) and not workers.late and setup.problem.motions_alone:
+    if unresolved(result) and not doubts and not workers.late and setup.problem.motions_alone:
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
     problem, cut = setup.problem, workers.late
     say("gain on held-out data")
@@ -241,7 +245,6 @@ def diagnose_fully(
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
     verdict = replace(verdict, notes=(*verdict.notes, *notes))
-    doubts = mislabelled(given)
     if doubts:
         verdict = withdrawn(verdict, doubts)
     return Diagnosis(
@@ -308,6 +311,7 @@ def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
         verdict,
         causes=tuple(replace(c, probability=min(c.probability, known_probability(1.0, True))) for c in verdict.causes),
         unexplained_verdict=UNKNOWN,
+        next_experiment="None before the labels of this recording are right: mend them in its map and diagnose again.",
         sentence=f"The recording looks mislabelled, so that no cause can be named: {doubts[0]}",
         notes=(*verdict.notes, *doubts),
     )

@@ -17,7 +17,11 @@ from ident.dataset import Dataset, Segment
 from robot_assets.errors import DataError
 
 RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: what still rings then has decayed
+BRAKE_TIME = 1.0  # s, in which the acceleration at the ends of a motion fades in its return
+END_TIME = 0.1  # s, over which slope and curvature of an end are taken
+END_SAMPLES = 12  # at least
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
+MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 NOISE_LINES = 10  # lines on either side over which the noise of the position is averaged
 SIGNAL_LEVEL = 2.0  # power over noise below which a line of the position counts as noise
@@ -244,12 +248,13 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
     n_return = int(np.ceil(max(RETURN_TIME, 0.05 * len(segment.t) / fs) * fs))
     N = scipy.fft.next_fast_len(len(segment.t) + n_return, real=True)
     n_return = N - len(segment.t)
-    q = close_motion(segment.q, n_return)
-    tau = close_motion(segment.tau, n_return)
+    q = close_motion(segment.q, n_return, fs, curvature=True)
+    tau = close_motion(segment.tau, n_return, fs, curvature=False)
     top = min(int(band_hz * N / fs), N // 2 - 1)
     n_lines = min(int(1.5 * top) + 2, N // 2)
     # A ripple is fast along a motion that is slow: on a grid of the compared band alone it would fold into it.
-    n_time = max(N, scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True))
+    fine = min(N, scipy.fft.next_fast_len(int(MOTION_RATE * N / fs), real=True))
+    n_time = max(fine, scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True))
     time = np.arange(n_time) * N / fs / n_time
     ramp = min(SETTLE_TIME, 0.1 * len(segment.t) / fs)
     end = len(segment.t) / fs
@@ -259,7 +264,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
     Q = _lines(q[None], n_lines)
     link = None
     if segment.q_link is not None:
-        link = _lines(close_motion(segment.q_link, n_return)[None], n_lines)
+        link = _lines(close_motion(segment.q_link, n_return, fs, curvature=True)[None], n_lines)
     return Group(
         operating_point=segment.operating_point or segment.name,
         segments=(segment.name,),
@@ -283,21 +288,42 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
     )
 
 
-def close_motion(x: np.ndarray, n_return: int) -> np.ndarray:
+def close_motion(x: np.ndarray, n_return: int, fs: float, *, curvature: bool) -> np.ndarray:
     """Append a return from the last sample to the first; (N + n_return, n).
 
-    A polynomial of fifth order with matching slopes and no curvature at its ends, so that the
-    return does not ring in the model.
+    A polynomial of fifth order with matching slopes, and none of higher order that end within ``BRAKE_TIME`` with
+    matching ``curvature``: a motor whose acceleration ended at once would ask for a step of torque, which rings.
+
+    Args:
+        fs: samples per second.
     """
-    width = min(20, len(x) // 4)
+    width = min(max(round(END_TIME * fs), END_SAMPLES), len(x) // 2)
+    v_end, a_end = _end_slope(x[-width:], -1)
+    v_start, a_start = _end_slope(x[:width], 0)
     span = n_return + 1
-    v_end = (x[-1] - x[-1 - width]) / width * span
-    v_start = (x[width] - x[0]) / width * span
     u = (np.arange(1, n_return + 1) / span)[:, None]
     s = u**3 * (10 - 15 * u + 6 * u**2)
     leave = u - 6 * u**3 + 8 * u**4 - 3 * u**5
     arrive = -4 * u**3 + 7 * u**4 - 3 * u**5
-    return np.concatenate([x, x[-1] + (x[0] - x[-1]) * s + v_end * leave + v_start * arrive])
+    back = x[-1] + (x[0] - x[-1]) * s + span * (v_end * leave + v_start * arrive)
+    if curvature:
+        brake = min(BRAKE_TIME * fs, span)
+        back += brake**2 * (a_end * _bump(u * span / brake) + a_start * _bump((1.0 - u) * span / brake))
+    return np.concatenate([x, back])
+
+
+def _end_slope(x: np.ndarray, at: int) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) slope and curvature per sample at the first or last of samples (N, n), by a cubic through all of them."""
+    t = np.arange(len(x), dtype=float)
+    t = (t - t[at]) / max(len(x) - 1, 1)
+    c = np.linalg.lstsq(np.vander(t, min(4, len(x)), increasing=True), x, rcond=None)[0]
+    c = np.concatenate([c, np.zeros((3, x.shape[1]))])
+    return c[1] / max(len(x) - 1, 1), 2.0 * c[2] / max(len(x) - 1, 1) ** 2
+
+
+def _bump(u: np.ndarray) -> np.ndarray:
+    """Unit curvature at 0, without value or slope there; none of the three from 1 on."""
+    return np.where(u < 1.0, 0.5 * u**2 * (1.0 - np.minimum(u, 1.0)) ** 3, 0.0)
 
 
 def mean_over_lines(x: np.ndarray, half: int) -> np.ndarray:

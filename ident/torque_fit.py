@@ -30,6 +30,8 @@ LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of
 STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
 GAP = 1e-6  # relative change of the cost that ends a fit
 LEAST_NOISE = 0.5  # of the noise of a linear arm, that is left in any direction of the residual
+LEAST_INFORMATION = 1e-12  # on a coordinate: less counts as this
+RIDGE = 1e-12  # relative, of a covariance
 LEAK = 0.03  # of the largest share of that noise, that is in any direction too
 LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
 SHORTER = 64.0  # factor on the damping of steps then
@@ -116,9 +118,14 @@ class Fit:
         return self.cost / max(self.count - len(self.names), 1)
 
     def covariance(self) -> np.ndarray:
-        """(p, p) of the fitted coordinates, scaled by the misfit where that exceeds one."""
-        ridge = 1e-12 * np.diag(np.maximum(np.diag(self.information), 1e-30))
-        return np.linalg.pinv(self.information + ridge, hermitian=True) * max(1.0, self.chi2_per_dof)
+        """(p, p) of the fitted coordinates, scaled by the misfit where that exceeds one; large where the data say nothing."""
+        return inverse(self.information, RIDGE) * max(1.0, self.chi2_per_dof)
+
+
+def inverse(H: np.ndarray, ridge: float) -> np.ndarray:
+    """Inverse of an information matrix, each coordinate in its own scale, steadied by a relative ``ridge``."""
+    size = np.sqrt(np.maximum(np.diag(H), LEAST_INFORMATION))
+    return np.linalg.inv(H / np.outer(size, size) + ridge * np.eye(len(H))) / np.outer(size, size)
 
 
 def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> np.ndarray:
@@ -158,12 +165,14 @@ def _with_record(S: np.ndarray, more: np.ndarray) -> np.ndarray:
 
 
 def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float) -> Weights:
-    """Weights at the current model; ``rho`` is a relative error added to the noise."""
+    """Weights at the current model; ``rho`` is a relative error added to the noise.
+
+    Lines of a motion, seen through its window, count in units of the noise of a whole record: neighbours share theirs, and
+    the sum of their squares is that of ``data_count`` independent numbers.
+    """
     whiten, covariance = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
         S = noise_covariance(problem, group, pred)
-        if group.window is not None:
-            S = S * np.mean(group.window**2)
         k = np.arange(S.shape[1])
         S[0] *= 4.0
         if rho > 0:

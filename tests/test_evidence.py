@@ -6,14 +6,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import ABSENT, POINTLESS_NATS, TEMPER, Candidate, astray, explained, occam, pointless, weigh
-from ident.diagnose import diagnose, harmful
+from ident.attribute import (
+    ABSENT,
+    POINTLESS_NATS,
+    TEMPER,
+    Candidate,
+    astray,
+    explained,
+    occam,
+    pointless,
+    polish,
+    pruned,
+    weigh,
+)
+from ident.diagnose import diagnose, harmful, identify
 from ident.extended import Effect
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.torque_fit import joint_costs, predictions, weighted_cost
+from ident.torque_fit import RIDGE, inverse, joint_costs, predictions, weighted_cost
 from ident.verdict import Gain
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
@@ -32,8 +44,6 @@ def candidate(h, p, information, cost=1000.0):
 
 @pytest.fixture(scope="module")
 def identified(clean):
-    from ident.diagnose import identify
-
     return clean[0], *identify(clean[0])
 
 
@@ -198,3 +208,32 @@ def test_a_gear_far_from_its_guess_has_gone_astray(identified):
 def test_an_extension_that_surely_harms_is_taken_back(interval, bad):
     assert harmful(Gain(("a", "b"), "rms", 1.0, 1.5, 0.1, -0.5, interval, "validation segments")) == bad
     assert not harmful(None)
+
+
+def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified, named):
+    """The data hold no effect: a friction that was let in stands for nothing, whichever place it has among others."""
+    _, setup, result = identified
+    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([1e-5, 0.0, 1e-3]))
+    model = replace(result.model, effects=(rub,))
+    found = pruned(setup.problem, polish(setup.problem, replace(result, model=model)))
+    assert found.model.effects == ()
+    assert found.cost < result.cost * (1.0 + 1e-6)
+
+
+def test_an_effect_that_the_data_need_stays(ur10, tmp_path):
+    hidden = parse_effect("coulomb_friction@elbow_joint:torque=5", ur10)
+    data = through_files(run_experiment(small_plan(ur10, 8, points=1, levels=(1.0,)), [hidden], seed=8), tmp_path)
+    setup, result = identify(data)
+    rub = {h.key: h for h in catalogue(setup.problem.structure)}["coulomb_friction", "elbow_joint"]
+    model = replace(result.model, effects=(Effect(rub, np.array([3.0, 0.0, 1e-3])),))
+    fitted = polish(setup.problem, replace(result, model=model))
+    assert pruned(setup.problem, fitted) is fitted
+
+
+def test_a_coordinate_that_the_data_do_not_feel_has_a_large_deviation():
+    """One beside others of very different sizes, as logarithms of parameters are."""
+    B = np.array([[1e6, 2.0, 0.0], [0.0, 1e-3, 0.0], [3.0, 0.0, 0.0]])
+    H = B.T @ B
+    C = inverse(H, RIDGE)
+    assert np.allclose(C[:2, :2] * np.outer([1e6, 1e-3], [1e6, 1e-3]), np.linalg.inv(H[:2, :2]) * np.outer([1e6, 1e-3], [1e6, 1e-3]), rtol=1e-3)
+    assert C[2, 2] > 1e12

@@ -312,6 +312,7 @@ def test_a_log_of_mislabelled_torques_names_no_cause(tmp_path):
     wrong = replace(data, segments=tuple(replace(s, tau=-s.tau) for s in data.segments))
     verdict = diagnose(wrong, max_causes=1, max_seconds=5)
     assert all(c.probability < 0.5 for c in verdict.causes)
+    assert not verdict.causes and "labels" in verdict.next_experiment
     assert "mislabelled" in verdict.sentence and "wrong sign" in verdict.notes[-1]
     assert verdict.unexplained_verdict == "unknown cause remains"
     assert "mislabelled" not in diagnose(data, max_causes=1, max_seconds=5).sentence

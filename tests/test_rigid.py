@@ -8,11 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ident.attribute import plainer
 from ident.dataset import Dataset, Segment
 from ident.diagnose import diagnose_fully, set_up, with_held_out
+from ident.extended import Effect, Model
 from ident.graybox import LinkChange, Parameters, build_structure
+from ident.hypotheses import catalogue
+from ident.hypotheses.sensing import torque_offset
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, fit_rigid, regressor
+from ident.torque_fit import fit
 from robot_assets.robot import Elasticity
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
@@ -177,3 +182,22 @@ def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
     verdict = diagnose_fully(through_files(data, tmp_path)).verdict
     assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("payload", "flange")]
     assert not verdict.notes
+
+
+def test_friction_whose_yielding_no_motion_shows_is_plain_friction(ur10, moved):
+    """Samples far apart do not show how a bristle yields that slips within a thousandth of them."""
+    problem = set_up(moved).problem
+    problem = replace(problem, structure=build_structure(ur10, links=CHANGED))
+    known = catalogue(problem.structure)
+    of = {h.key: h for h in known}
+    bristles = tuple(
+        Effect(of["presliding_friction", name], np.array([1e8, torque]))
+        for name, torque in zip(ur10.joint_names, COULOMB, strict=True)
+    )
+    offsets = tuple(Effect(torque_offset(j, name), OFFSET[j : j + 1]) for j, name in enumerate(ur10.joint_names))
+    fitted = fit(problem, Model(problem.structure, problem.nominal, (*offsets, *bristles)), iterations=20)
+    found = plainer(problem, fitted, known, set())
+    named = found.model.effects[len(offsets) :]
+    assert {e.hypothesis.effect for e in named} == {"coulomb_friction"} and len(named) == ur10.n
+    assert [e.value("torque") for e in named] == pytest.approx(COULOMB, rel=0.05)
+    assert plainer(problem, fitted, known, {e.hypothesis.key for e in bristles}) is fitted

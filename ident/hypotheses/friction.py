@@ -10,6 +10,7 @@ from ident.inverse import Motion
 
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
+SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
 
@@ -97,7 +98,13 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
         screen,
         "The residual torque of {joint} falls from {static:.3g} N m at rest to {coulomb:.3g} N m above"
         " {stribeck_velocity:.2g} rad/s: friction with a Stribeck dip.",
-        options={"absorbs": "coulomb_friction", "absorb": absorb, "trivial": lambda p: p[1] < 1.15 * p[0]},
+        options={
+            "absorbs": "coulomb_friction",
+            "absorb": absorb,
+            "apart": "stribeck_velocity",
+            "special": lambda p: np.array([p[0], 0.0, p[3]]),
+            "trivial": lambda p: p[1] < 1.15 * p[0],
+        },
     )
 
 
@@ -126,7 +133,12 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
         "The residual torque of {joint} makes loops in position: friction that yields as a spring of"
         " {stiffness:.3g} N m/rad before it slips at {coulomb:.3g} N m.",
         variable="q",
-        options={"absorbs": "coulomb_friction", "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0]])},
+        options={
+            "absorbs": "coulomb_friction",
+            "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0]]),
+            "apart": "stiffness",
+            "special": lambda p: np.array([p[1], 0.0, SHARP]),
+        },
     )
 
 

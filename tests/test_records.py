@@ -1,0 +1,63 @@
+"""Motions as records: their return to the start, and the noise seen through their window."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.dataset import Dataset, Segment
+from ident.diagnose import set_up
+from ident.extended import Model, predict
+from ident.records import close_motion
+from ident.torque_fit import data_count, make_weights
+from robot_assets.robot import load_robot
+
+RATE = 500.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6])
+def test_the_return_of_a_motion_goes_on_with_its_acceleration(noise):
+    """A motion that is cut while it accelerates, at both ends."""
+    t = np.arange(4000) / RATE
+    rng = np.random.default_rng(0)
+    x = np.stack([0.8 * np.cos(2.0 * t), 0.3 * np.sin(5.0 * t + 1.0)], axis=1)
+    whole = close_motion(x + noise * rng.normal(size=x.shape), 4000, RATE, curvature=True)
+    around = np.concatenate([whole[-200:], whole, whole[:200]])
+    v = np.gradient(around, 1 / RATE, axis=0)
+    a = np.diff(around, 2, axis=0) * RATE**2
+    assert np.array_equal(whole[:4000], x + noise * np.random.default_rng(0).normal(size=x.shape))
+    top = np.abs(a[200:4000]).max(axis=0)
+    for at in (200, 4200):
+        seams = a[at - 6 : at + 4]
+        step = np.abs(seams[-1] - seams[0])
+        # The seam spans 9 samples, over which it also falls: by 9 times itself a second of the brake.
+        assert np.all(step < 0.2 * top + 4 * noise * RATE**2)
+        assert np.all(np.abs(v[at + 1] - v[at - 2]) < 3.6 / RATE * top + 4 * noise * RATE)
+    assert np.abs(whole[4000:]).max() < 4.0
+
+
+@pytest.mark.parametrize("seconds", [4.0, 15.0])
+def test_noise_of_a_motion_costs_as_much_as_it_counts(seconds):
+    """White noise of the torque alone, whitened: as many squares as numbers are compared, however short the motion is."""
+    bench = load_robot("twomass")
+    rng = np.random.default_rng(1)
+    t = np.arange(int(seconds * RATE)) / RATE
+    q = 0.3 * (1 - np.cos(2 * np.pi * t / seconds))[:, None]
+    motion = Segment(name="m", role="identification", kind="trajectory", t=t, tau=0.0 * q, q=q)
+    data = Dataset(
+        name="noise", robot_ref="twomass", robot=bench, sample_rate=RATE, joints=bench.joint_names, input_hold="none",
+        q_std=np.array([1e-12]), tau_std=np.array([0.05]), controller=None, segments=(motion,),
+    )  # fmt: skip
+    problem = set_up(data).problem
+    (group,) = problem.groups
+    pred = predict(Model(problem.structure, problem.nominal), group, problem.sampling)
+    weights = make_weights(problem, [pred], 0.0)
+    costs = []
+    for _ in range(200):
+        noise = np.zeros((1, group.n_time, 1))
+        inside = np.linspace(0, group.n_time, len(group.window), endpoint=False) < group.n_time
+        noise[0, inside] = rng.normal(size=(inside.sum(), 1))
+        lines = group.to_lines(noise) * 0.05 * np.sqrt(group.n_time / (group.period_time * RATE))
+        error = weights.apply(0, group.observe(lines))
+        costs.append(np.sum(np.abs(error) ** 2))
+    assert np.mean(costs) == pytest.approx(data_count(replace(problem)), rel=0.05)
