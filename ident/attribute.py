@@ -34,9 +34,11 @@ from ident.torque_fit import (
 )
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
+DOUBTED_LEVEL = 1e-2  # the same where the drives that fit cannot be those of this arm
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
 RECORD_EXCESS = 1.6  # the same of a model along the record
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
+DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive among the parameters
 ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain beyond that
@@ -122,9 +124,9 @@ def fit_baseline(
 ) -> Fit:
     """Baseline parameters of the gray-box, with the ``effects`` that every candidate has too.
 
-    Where the fit leaves more than the noise it is started again with other dampers: they are
-    determined far worse than springs, and a damper that has once collapsed does not come back. Gears that have gone
-    astray, as one that is overdamped and hides its spring, begin again from their guesses.
+    Where the fit leaves more than the noise it is started again: with less error added from the first, which leads into
+    other minima; with other dampers, which are determined far worse than springs, and do not come back once they have
+    collapsed; and gears that have gone astray, as one that is overdamped and hides its spring, from their guesses.
     """
     start = Model(problem.structure, problem.nominal, effects)
     best = first = anneal(problem, start, progress=progress)
@@ -140,19 +142,22 @@ def fit_baseline(
             progress=progress,
         )
 
+    if best.chi2_per_dof > DETECTION_EXCESS:
+        other = anneal(problem, start, ladder=ANNEALING[1:], progress=progress)
+        best = min(best, other, key=lambda f: (np.sum(astray(problem, f)), f.cost))
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
             damping = np.maximum(par.damping, problem.nominal.damping) * factor
             best = min(best, again(replace(par, damping=damping)), key=lambda f: f.cost)
-        lost = astray(problem, best)
-        if np.any(lost):
-            par, guess = best.model.par, problem.nominal
-            stiffness, damping = np.where(lost, [guess.stiffness, guess.damping], [par.stiffness, par.damping])
-            other = again(replace(par, stiffness=stiffness, damping=damping))
-            # Where they only go astray elsewhere they stand for what is missing.
-            if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
-                best = other
+    lost = astray(problem, best)
+    if best.chi2_per_dof > DETECTION_EXCESS and np.any(lost):
+        par, guess = best.model.par, problem.nominal
+        drives = {name: np.where(lost, getattr(guess, name), getattr(par, name)) for name in DRIVE}
+        other = again(replace(par, **drives))
+        # Where they only go astray elsewhere they stand for what is missing.
+        if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
+            best = other
     return replace(best, softer=first.softer)
 
 
@@ -184,7 +189,8 @@ def attribute(
         workers: where candidates are fitted.
     """
     p_value = discrepancy_p_value(baseline)
-    detected = p_value < DETECTION_LEVEL and baseline.chi2_per_dof > DETECTION_EXCESS
+    level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
+    detected = p_value < level and baseline.chi2_per_dof > DETECTION_EXCESS
     if hypotheses is None:
         # In motions alone offsets of the torque are found with the inertias of the links, as part of the baseline.
         hypotheses = catalogue(problem.structure, offsets=not problem.motions_alone)
@@ -691,8 +697,7 @@ def beside_strong(
 
     likely = min(ranked, key=lambda x: x[1].cost)[0].joint if ranked else -1
     chosen = strong_effects(problem, before, scores, likely)
-    if not problem.motions_alone:
-        chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
+    chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
     fits = workers.map_in_time(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
     pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
@@ -711,7 +716,8 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
     """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
 
     A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
-    of the time hardly shows its inertia: the linear step of a score says little about either.
+    of the time hardly shows its inertia: the linear step of a score says little about either. Motions below the
+    resonances hardly show the gears.
     """
     preds = predictions(problem, stage.model, stage.remainders)
     loudest = int(np.argmax(stage.costs))
@@ -719,7 +725,9 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
     return [
         replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))
         for s in scores
-        if s.hypothesis.joint in scales and "size" in s.hypothesis.options
+        if s.hypothesis.joint in scales
+        and "size" in s.hypothesis.options
+        and not (problem.motions_alone and s.hypothesis.channel == "spring")
     ]
 
 

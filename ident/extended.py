@@ -110,11 +110,12 @@ class Prediction:
         rng = np.random.default_rng(0)
         draw = rng.normal(size=(2, *self.U.shape)) * np.sqrt(0.5 * group.position_noise)
         noisy = replace(self.solution, Q=self.solution.Q + draw[0] + 1j * draw[1])
+        moving = replace(group, rest=None)  # at rest the noise of the position cancels
         for effect in at_motor:
             j = effect.hypothesis.joint
             k = self.par.stiffness[j]
             with_noise, without = (
-                effect.hypothesis.law(effect.p, Motion(group, x, self.par), j, k) for x in (noisy, self.solution)
+                effect.hypothesis.law(effect.p, Motion(moving, x, self.par), j, k) for x in (noisy, self.solution)
             )
             change = self.plane.record * self.motion(group).lines(with_noise - without)
             out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
@@ -303,12 +304,26 @@ def _inner_torques(
 
 
 def _motor_torques(par: Parameters, motion: Motion, effects: Sequence[Effect]) -> np.ndarray:
-    """Spectra (S, L, n) of the torques of effects at the motors."""
+    """Spectra (S, L, n) of the torques of effects at the motors; dry friction at rest balances what the others leave."""
     out = np.zeros_like(motion.solution.Q)
-    for effect in effects:
-        j = effect.hypothesis.joint
-        out[..., j] += motion.lines(effect.hypothesis.law(effect.p, motion, j, par.stiffness[j]))
+    for effect in sorted(effects, key=is_dry):
+        h, j = effect.hypothesis, effect.hypothesis.joint
+        seen = replace(motion, beside=out) if is_dry(effect) else motion
+        out[..., j] += motion.lines(h.law(effect.p, seen, j, par.stiffness[j]))
     return out
+
+
+def is_dry(effect: Effect) -> bool:
+    """Whether an effect is a friction that at rest is what balances the drive."""
+    return bool(effect.hypothesis.options.get("dry"))
+
+
+def beside(effects: Sequence[Effect], of: Effect, motion: Motion) -> Motion:
+    """The motion as a law at a motor sees it beside the other effects there."""
+    if not is_dry(of) or motion.group.rest is None:
+        return motion
+    others = [e for e in effects if e is not of and e.hypothesis.channel == "motor" and not is_dry(e)]
+    return replace(motion, beside=_motor_torques(motion.par, motion, others)) if others else motion
 
 
 def is_along_record(h: Hypothesis) -> bool:

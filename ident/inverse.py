@@ -116,11 +116,15 @@ class Solution:
 
 @dataclass(frozen=True)
 class Motion:
-    """Time signals of a solution, made where they are asked for; each (S, T) on the group's grid."""
+    """Time signals of a solution, made where they are asked for; each (S, T) on the group's grid.
+
+    ``beside``: spectra (S, L, n) of what else acts at the motors, N m.
+    """
 
     group: Group
     solution: Solution
     par: Parameters
+    beside: np.ndarray | float = 0.0
 
     def q(self, joint: int) -> np.ndarray:
         """Motor position without lines of noise alone, rad."""
@@ -157,6 +161,12 @@ class Motion:
     def torque(self, joint: int) -> np.ndarray:
         """Recorded motor torque without lines of noise alone, N m."""
         return self._time(self.group.U, joint, share=self.group.torque_share[..., joint])
+
+    def asked(self, joint: int) -> np.ndarray:
+        """Torque that the record leaves to a friction of the motor, N m."""
+        s, x = 1j * self.group.omega[:, None], self.solution
+        linear = (s**2 * self.par.inertia + s * self.par.viscous) * x.Q + x.tau_s @ self.par.coupling
+        return self._time(self.group.U - linear - self.beside, joint)
 
     @property
     def time(self) -> np.ndarray:

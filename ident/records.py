@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 
 from ident.dataset import Dataset, Segment
 from robot_assets.errors import DataError
@@ -20,6 +21,8 @@ RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: w
 BRAKE_TIME = 1.0  # s, in which the acceleration at the ends of a motion fades in its return
 END_TIME = 0.1  # s, over which slope and curvature of an end are taken
 END_SAMPLES = 12  # at least
+REST_TIME, REST_SAMPLES = 0.05, 5  # s, and samples at least, within which a motor that stands still does not move
+REST_NOISE = 6.0  # beyond this many standard deviations of its noise
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
@@ -50,6 +53,7 @@ class Group:
         temperature: (S, n) degC means, or None.
         period_time: s.
         periods: (S,) number of periods averaged.
+        rest: (n_time, n) where the motors of a motion stand still, or None for periodic data.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -73,6 +77,7 @@ class Group:
     periods: np.ndarray
     white_noise: np.ndarray
     white_torque_noise: np.ndarray
+    rest: np.ndarray | None = None
 
     @cached_property
     def position_noise(self) -> np.ndarray:
@@ -285,7 +290,18 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
         periods=np.ones(1, int),
         white_noise=difference_noise(segment.q) ** 2 / N,
         white_torque_noise=difference_noise(segment.tau) ** 2 / N,
+        rest=_at_rest(segment.q, fs)[np.minimum((time * fs).astype(int), len(segment.t) - 1)],
     )
+
+
+def _at_rest(q: np.ndarray, fs: float) -> np.ndarray:
+    """Where motors stand still (N, n): samples in windows of ``REST_TIME`` that hold no more than noise, or a step of the encoder."""
+    width = max(round(REST_TIME * fs), REST_SAMPLES)
+    steps = np.abs(np.diff(q, axis=0))
+    least = np.min(np.where(steps > 0, steps, np.inf), axis=0)
+    level = np.maximum(REST_NOISE * difference_noise(q), np.where(np.isfinite(least), 1.5 * least, 0.0))
+    span = scipy.ndimage.maximum_filter1d(q, width, axis=0) - scipy.ndimage.minimum_filter1d(q, width, axis=0)
+    return scipy.ndimage.maximum_filter1d((span <= level).astype(np.uint8), width, axis=0) > 0
 
 
 def close_motion(x: np.ndarray, n_return: int, fs: float, *, curvature: bool) -> np.ndarray:

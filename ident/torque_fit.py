@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.columns import Columns
-from ident.extended import Effect, Model, Prediction, joints_along_record, predict, predict_at
+from ident.extended import Effect, Model, Prediction, beside, joints_along_record, predict, predict_at
 from ident.graybox import Parameters, Structure, parameter_names
 from ident.inverse import Motion, Sampling, Torques, baseline_products
 from ident.noise import residual_covariance, white_covariance
@@ -25,6 +25,7 @@ PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural
 PRIOR_TIMING = 0.25  # of the common timing offset, samples
 TIMING_STEP = 1e-6  # s, for differences
 TIMING_LIMIT = 0.6  # samples
+HELD, HOLD = 0.1, 0.04  # error added to the noise from which drives are held, and how strongly
 ANNEALING = (0.5, 0.1, 0.02, 0.0)
 LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
 STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
@@ -351,7 +352,8 @@ def _motor_columns(
     model: Model, group: Group, pred: Prediction, effect: Effect, steps: Sequence[tuple[np.ndarray, float]]
 ) -> list[np.ndarray]:
     """Those of a law at the motor: the motion does not change, and only its own torque does."""
-    h, motion, j = effect.hypothesis, pred.motion(group), effect.hypothesis.joint
+    h, j = effect.hypothesis, effect.hypothesis.joint
+    motion = beside(model.effects, effect, pred.motion(group))
     k = pred.par.stiffness[j]
     now, columns = h.law(effect.p, motion, j, k), []
     drives = [e for e in model.effects if e.hypothesis.channel == "drive" and e.hypothesis.joint == j]
@@ -374,7 +376,11 @@ def anneal(
     remainders: Sequence[np.ndarray] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
-    """Fits under less and less error added to the noise (``ladder``), each from where the last one ended."""
+    """Fits under less and less error added to the noise (``ladder``), each from where the last one ended.
+
+    With as much error as ``HELD`` the drives are held near their starting guesses: there the data say little, and a gear
+    that once has lost its spring does not find it again.
+    """
     stages: list[Fit] = []
     for i, rho in enumerate(ladder):
         stages.append(
@@ -382,6 +388,7 @@ def anneal(
                 problem,
                 stages[-1].model if stages else model,
                 rho=rho,
+                hold=HOLD if rho >= HELD else 0.0,
                 iterations=iterations,
                 remainders=stages[-1].remainders if stages else remainders,
                 progress=None if progress is None else lambda text, i=i: progress(f"{text}, stage {i + 1}/{len(ladder)}"),
@@ -395,6 +402,7 @@ def fit(
     model: Model,
     *,
     rho: float = 0.0,
+    hold: float = 0.0,
     iterations: int = 12,
     weights: Weights | None = None,
     remainders: Sequence[np.ndarray] | None = None,
@@ -405,6 +413,8 @@ def fit(
     Args:
         model: start.
         rho: relative error added to the noise.
+        hold: penalty on the drives by their squared distance from the starting guesses, natural logarithm, beyond the
+            weak prior; in units of the data that are compared.
         iterations: at most.
         weights: those to fit under; of the start where None.
         remainders: geometric remainders to start from.
@@ -414,6 +424,7 @@ def fit(
     center, prior = _prior(problem, model)
     Ws = list(remainders) if remainders is not None else [None] * len(problem.groups)
     count = data_count(problem)
+    prior[:m] += hold * count
     x = pack(model)
     preds = predictions(problem, model, Ws, steps=None if Ws[0] is None else 1)
     Ws = [p.solution.W for p in preds]

@@ -1,12 +1,13 @@
 """Motions as records: their return to the start, and the noise seen through their window."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ident.dataset import Dataset, Segment
-from ident.diagnose import set_up
+from ident.diagnose import diagnose, set_up
 from ident.extended import Model, predict
 from ident.records import close_motion
 from ident.torque_fit import data_count, make_weights
@@ -61,3 +62,35 @@ def test_noise_of_a_motion_costs_as_much_as_it_counts(seconds):
         error = weights.apply(0, group.observe(lines))
         costs.append(np.sum(np.abs(error) ** 2))
     assert np.mean(costs) == pytest.approx(data_count(replace(problem)), rel=0.05)
+
+
+def test_friction_at_rest_is_what_the_drive_asks_of_it(tmp_path):
+    """Moves from point to point with dwells, in each of which dry friction happens to balance another torque."""
+    bench, rng = load_robot("twomass"), np.random.default_rng(3)
+    size, fs, n = 0.8, 500.0, 150
+    u = np.arange(n) / n
+    step = u**3 * (10 - 15 * u + 6 * u**2)
+    angles = np.cumsum(rng.choice([-1.0, 1.0], 30) * rng.uniform(0.5, 2.0, 30))
+    q, friction = [], []
+    for a, b in itertools.pairwise(angles):
+        q += [a + (b - a) * step, np.full(100, b)]
+        friction += [np.full(n, size * np.sign(b - a)), np.full(100, rng.uniform(-size, size))]
+    q, friction = np.concatenate(q), np.concatenate(friction)
+    v, joint = np.gradient(q, 1 / fs), bench.joints[0]
+    inertia = joint.motor_inertia + 0.00477
+    tau = inertia * np.gradient(v, 1 / fs) + joint.viscous_friction * v + friction + 0.02 * rng.normal(size=len(q))
+    cut = 250 * 20
+    motions = [
+        Segment(name=name, role=role, kind="trajectory", t=np.arange(len(q[part])) / fs, tau=tau[part, None], q=q[part, None] + 1e-7 * rng.normal(size=(len(q[part]), 1)))
+        for name, role, part in (("a", "identification", slice(None, cut)), ("b", "validation", slice(cut, None)))
+    ]  # fmt: skip
+    data = Dataset(
+        name="moves", robot_ref="twomass", robot=bench, sample_rate=fs, joints=bench.joint_names, input_hold="none",
+        q_std=np.array([1e-7]), tau_std=np.array([0.02]), controller=None, segments=tuple(motions),
+    )  # fmt: skip
+    assert np.mean(set_up(data).problem.groups[0].rest[:cut]) == pytest.approx(0.4, abs=0.1)
+    verdict = diagnose(data, max_causes=2)
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("coulomb_friction", "drive")]
+    found = verdict.causes[0].parameters
+    assert found["torque"].value == pytest.approx(size, rel=0.02) and abs(found["asymmetry"].value) < 0.05
+    assert verdict.gain.gap_closed > 0.85

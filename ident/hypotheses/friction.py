@@ -10,6 +10,8 @@ from ident.inverse import Motion
 
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
+REST_QUANTILE = 0.95  # of what a friction balances at rest, that says its size
+LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
@@ -24,15 +26,31 @@ def direction(v: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
     return smooth_sign(np.ascontiguousarray(v), float(smoothing))
 
 
+def sense(motion: Motion, j: int, smoothing: float, size: np.ndarray | float | None = None) -> np.ndarray:
+    """Dry friction over its ``size`` (N m): the direction of the motion; where the motor stands still what balances the drive.
+
+    At rest dry friction is whatever the drive asks of it, up to its size (Coulomb 1785): no history of the velocity tells
+    it, and the recorded torque does. Without a size, as in a unit response, the rest itself says one.
+    """
+    s = direction(motion.v(j), smoothing)
+    rest = motion.group.rest
+    if rest is None or not np.any(rest[:, j]):
+        return s
+    asked = motion.asked(j)
+    if size is None:
+        size = np.quantile(np.abs(asked[:, rest[:, j]]), REST_QUANTILE)
+    return np.where(rest[:, j], np.clip(asked / np.maximum(size, LEAST_TORQUE), -1.0, 1.0), s)
+
+
 def coulomb_friction(joint: int, place: str) -> Hypothesis:
     """``torque (sign v + asymmetry)`` (effects.md)."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        s = direction(motion.v(j), p[2])
+        s = sense(motion, j, p[2], p[0])
         return p[0] * (s + p[1] * np.abs(s))
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        s = direction(motion.v(j), shape[0])
+        s = sense(motion, j, shape[0])
         return Screen(
             (s, np.abs(s)),
             lambda c: np.array([c[0], np.clip(c[1] / c[0], -0.8, 0.8), shape[0]]) if c[0] > 0 else None,
@@ -54,7 +72,7 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
         screen,
         "The residual torque of {joint} is a step in its velocity: a friction torque of {torque:.3g} N m"
         " against the motion whatever its speed.",
-        options={"size": lambda s: np.array([0.4 * s.torque, 0.0, 0.05 * s.v])},
+        options={"dry": True, "size": lambda s: np.array([0.4 * s.torque, 0.0, 0.05 * s.v])},
     )
 
 
@@ -63,12 +81,12 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         v = motion.v(j)
-        dip = max(p[1] - p[0], 0.1 * p[0])
-        return direction(v, p[3]) * (p[0] + dip * np.exp(-((v / p[2]) ** 2)))
+        size = p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-((v / p[2]) ** 2))
+        return sense(motion, j, p[3], size) * size
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)
-        s = direction(v, shape[0] * 0.02)
+        s = sense(motion, j, shape[0] * 0.02)
 
         def start(c):
             if c[0] + c[1] <= 0:
@@ -103,6 +121,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "absorb": absorb,
             "apart": "stribeck_velocity",
             "special": lambda p: np.array([p[0], 0.0, p[3]]),
+            "dry": True,
             "trivial": lambda p: p[1] < 1.15 * p[0],
         },
     )
@@ -145,8 +164,9 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
 def load_dependent_friction(joint: int, place: str) -> Hypothesis:
     """``coefficient |tau_s| sign v`` (Bittencourt and Gunnarsson 2012)."""
 
-    def unit(motion: Motion, j: int, smoothing: float) -> np.ndarray:
-        return np.abs(motion.tau_s(j)) * direction(motion.v(j), smoothing)
+    def unit(motion: Motion, j: int, smoothing: float, coefficient: float | None = None) -> np.ndarray:
+        load = np.abs(motion.tau_s(j))
+        return load * sense(motion, j, smoothing, None if coefficient is None else coefficient * load)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         return Screen(
@@ -159,11 +179,12 @@ def load_dependent_friction(joint: int, place: str) -> Hypothesis:
         joint,
         "motor",
         (Parameter("coefficient", "1", 1e-9, 2.0, log=True), SMOOTHING),
-        lambda p, motion, j, k: p[0] * unit(motion, j, p[1]),
+        lambda p, motion, j, k: p[0] * unit(motion, j, p[1], p[0]),
         lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
         screen,
         "The friction torque of {joint} is {coefficient:.3g} of the torque it transmits: it differs"
         " between postures as the load does.",
+        options={"dry": True},
     )
 
 
@@ -173,12 +194,13 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
     Viscous and Coulomb friction change alike; ``relative_change`` is negative where they fall.
     """
 
-    def unit(motion: Motion, j: int, tau: float, smoothing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        v = motion.v(j)
-        return v, direction(v, smoothing), 1.0 - np.exp(-motion.time / tau)
+    def unit(
+        motion: Motion, j: int, tau: float, smoothing: float, size: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return motion.v(j), sense(motion, j, smoothing, size), 1.0 - np.exp(-motion.time / tau)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        v, s, warm = unit(motion, j, p[1], p[4])
+        v, s, warm = unit(motion, j, p[1], p[4], p[2])
         return p[2] * s * (1.0 + p[0] * warm) + p[3] * p[0] * warm * v
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
@@ -215,7 +237,7 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
         " of {time_constant:.0f} s.",
         variable="time",
-        options={"absorbs": "coulomb_friction", "absorb": absorb, "essential": "relative_change"},
+        options={"absorbs": "coulomb_friction", "absorb": absorb, "essential": "relative_change", "dry": True},
     )
 
 
@@ -240,20 +262,35 @@ def velocity_power(joint: int, place: str, power: int) -> Hypothesis:
 
 
 def position_friction(joint: int, place: str) -> Hypothesis:
-    """Decoy: friction that depends on direction and position."""
+    """Decoy: friction whose size depends on the position of the joint, ``(constant + slope q + curvature q^2) sign(v)``."""
 
-    def unit(motion: Motion, j: int) -> np.ndarray:
+    def units(motion: Motion, j: int, smoothing: float) -> tuple[np.ndarray, ...]:
+        q, s = motion.q(j), sense(motion, j, smoothing)
+        return s, s * q, s * q**2
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         q = motion.q(j)
-        return direction(motion.v(j)) * (q - q.mean(axis=1, keepdims=True))
+        size = p[0] + p[1] * q + p[2] * q**2
+        return size * sense(motion, j, p[3], np.abs(size))
 
     return Hypothesis(
         "unknown:position_friction",
         place,
         joint,
         "motor",
-        (Parameter("coefficient", "N m/rad", -1e9, 1e9),),
-        lambda p, motion, j, k: p[0] * unit(motion, j),
-        lambda scale: [()],
-        lambda motion, j, k, shape: Screen((unit(motion, j),), lambda c: np.array([c[0]]), ()),
-        "The residual torque of {joint} changes sign with direction and grows with position.",
+        (
+            Parameter("constant", "N m", -1e7, 1e7),
+            Parameter("slope", "N m/rad", -1e9, 1e9),
+            Parameter("curvature", "N m/rad2", -1e9, 1e9),
+            SMOOTHING,
+        ),
+        law,
+        lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
+        lambda motion, j, k, shape: Screen(units(motion, j, shape[0]), lambda c: np.array([*c, shape[0]]), shape),
+        "The residual torque of {joint} changes sign with direction, and its size with position.",
+        options={
+            "absorbs": "coulomb_friction",
+            "absorb": lambda p, weights, old: np.array([old[0] + weights[0], weights[1], weights[2], old[2]]),
+            "dry": True,
+        },
     )
