@@ -329,16 +329,19 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
     return other if other.cost - result.cost < swapped * MIN_EVIDENCE * scale else result
 
 
-def explained(before: Fit, after: Fit) -> float:
+def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
     """Share of the excess over noise that a cause explains: of all of it, or at the joint where it explains most.
 
     Of several causes at different joints each explains a part of the whole and most of its own joint.
+
+    Args:
+        noise: of what is compared, in units of the weights: next to nothing where these bear with large errors.
     """
     falls = before.costs - after.costs
     joint = int(np.argmax(falls))
-    noise = before.count / len(falls)
-    whole = np.sum(falls) / max(before.cost - before.count, 1.0)
-    return float(max(whole, falls[joint] / max(before.costs[joint] - noise, 1.0)))
+    floor = noise * before.count
+    whole = np.sum(falls) / max(before.cost - floor, 1.0)
+    return float(max(whole, falls[joint] / max(before.costs[joint] - floor / len(falls), 1.0)))
 
 
 def revived(problem: Problem, model: Model) -> Model:
@@ -488,7 +491,7 @@ def explore_softly(
     """
     stage, level = soften(problem, current)
     found, scores = explore(problem, stage, hypotheses, 0.0, workers, rough=True)
-    softly = {h.key: explained(stage, r) for h, r in found[:FINALISTS]}
+    softly = {h.key: explained(stage, r, noise=0.0) for h, r in found[:FINALISTS]}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]

@@ -63,7 +63,7 @@ def conclude(
     """
     final = result.final
     left = result.left_share if result.detected else 0.0
-    refuted = result.unknown or fails_held_out(gain, final)
+    refuted = result.unknown or fails_held_out(gain, final, left)
     unknown = result.detected and (
         refuted
         or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)

@@ -15,6 +15,7 @@ CLEAR = 2.0  # held-out error of the baseline over the noise from which it tells
 CLOSED = 0.5  # share of the gap that the extended model must then close
 CARRIED = 0.8  # the same where it explains the data that it was fitted to down to the noise
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
+SHORT = 0.25  # by which the gap closed on held-out data may fall short of what the fitted ones promise
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 
@@ -46,11 +47,14 @@ def explained_share(found: Round, final: Fit) -> float:
     return fall / max(fall + left, 1e-300)
 
 
-def fails_held_out(gain: Gain | None, final: Fit) -> bool:
+def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
     """Whether held-out data refute the extended model: no name is trusted then.
 
     It predicts them worse than the baseline, or leaves most of a clear error that the causes were named for;
     or it explains the data it was fitted to, and leaves more of the held-out ones than a model that is right.
+
+    Args:
+        left: share of the discrepancy, as power, that the model leaves of the data that it was fitted to.
     """
     if gain is None:
         return False
@@ -59,7 +63,8 @@ def fails_held_out(gain: Gain | None, final: Fit) -> bool:
     if gain.gap_closed is None or not gain.before > CLEAR * gain.noise_floor:
         return False
     settled = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
-    return gain.gap_closed < (CARRIED if settled else CLOSED)
+    expected = 1.0 - np.sqrt(left)
+    return gain.gap_closed < max(CARRIED if settled else CLOSED, expected - SHORT)
 
 
 def collapsed(problem: Problem, final: Fit) -> bool:

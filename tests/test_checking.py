@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from ident.channel_checks import link_skew, torque_skew
+from ident.channel_checks import link_skew, lost_sample_warnings, torque_skew
 from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
 from robot_assets.robot import load_robot
@@ -189,3 +189,29 @@ def test_short_and_odd_recordings_are_reported_too(arm, samples, kind):
         s = Segment("log", "trajectory", "identification", np.arange(samples) / rate, x, x, qd=x, q_link=q_link)
         report = inspect_dataset(replace(dataset(arm, s), sample_rate=rate))
         assert report.warnings and report.text() and report.to_dict()
+
+
+def test_one_joint_whose_torque_comes_late_is_no_skew_of_the_channels():
+    robot = load_robot("ur10_bare")
+    s = recording(robot, np.random.default_rng(7), late=0.0, q_link_late=0.0)
+    tau = s.tau.copy()
+    shift = round(0.012 * dataset(robot, s).sample_rate)
+    tau[shift:, 2] = s.tau[:-shift, 2]
+    assert not torque_skew(replace(s, tau=tau), dataset(robot, s)).sure
+    whole = s.tau.copy()
+    whole[shift:] = s.tau[:-shift]
+    found = torque_skew(replace(s, tau=whole), dataset(robot, s))
+    assert found.sure and found.late == pytest.approx(0.012, abs=1e-3)
+
+
+def test_longer_and_longer_steps_are_no_lost_samples():
+    """A slow log of a joint that speeds up, and the same log without one of its samples."""
+    robot = load_robot("twomass")
+    t = np.arange(400) / 100.0
+    q = (0.5 * np.sin(2 * np.pi * 1.5 * t) ** 3)[:, None]
+    s = Segment(name="a", role="identification", kind="trajectory", t=t, tau=0.1 * q, q=q)
+    assert lost_sample_warnings(s, replace(dataset(robot, s), sample_rate=100.0)) == []
+    smooth = np.sin(2 * np.pi * 0.2 * np.arange(4000) / 1000.0)[:, None]
+    gone = np.delete(smooth, np.arange(200, 3800, 300), axis=0)
+    cut = replace(s, q=gone, tau=0.1 * gone, t=np.arange(len(gone)) / 1000.0)
+    assert any("dropped" in w for w in lost_sample_warnings(cut, dataset(robot, cut)))

@@ -136,9 +136,20 @@ def _joined(
 
 
 def _words(name: str) -> tuple[str, ...]:
-    """Parts of a name: "rec.actPos_mot1" gives rec, act, pos, mot."""
+    """Parts of a name: "rec.actPos_mot1" gives rec, act, pos, mot; "Istposition" gives ist, position."""
     name = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
-    return tuple(w.lower() for w in re.findall(r"[A-Za-zµ]+", name))
+    words = (w.lower() for w in re.findall(r"[A-Za-zµ]+", name))
+    return tuple(part for w in words for part in _split(w))
+
+
+def _split(word: str) -> tuple[str, ...]:
+    """A word, or the two that it is put together of: a role and a quantity."""
+    quantities = [q for table in WORDS.values() for q in table if len(q) > 2]
+    for role in (*REFERENCE, *LINK, *MOTOR, *ACTUAL):
+        rest = word.removeprefix(role)
+        if len(role) > 2 and rest != word and any(rest.startswith(q) for q in quantities):
+            return role, rest
+    return (word,)
 
 
 def _families(signals: dict[str, np.ndarray], arm: Robot) -> list[Family]:

@@ -106,7 +106,8 @@ class Hypothesis:
             place of one with parameters ``old`` at the same joint. ``apart``: the parameter that sets it apart from that
             special case, and ``special(p)`` the parameters of the special case that it is where the data do not show this one. ``essential`` names the parameter without
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm
-            may have several steady motions with it. ``dry``: a friction that at rest balances what is asked of it. ``nats``: log odds before the data, 0 where there is no reason.
+            may have several steady motions with it. ``rest(p)``: position about which a law of
+            the link acts. ``dry``: a friction that at rest balances what is asked of it. ``nats``: log odds before the data, 0 where there is no reason.
             ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
     """
 
