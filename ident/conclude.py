@@ -25,6 +25,7 @@ from ident.trust import (
     fails_held_out,
     known_probability,
     left_of,
+    too_fast,
 )
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
@@ -78,6 +79,8 @@ def conclude(
         found = rounds[effect.hypothesis.key]
         trust = known_probability(left_of(effect.hypothesis, result), doubted)
         trust *= explained_share(found, final)
+        if pointless(effect) or too_fast(problem, last, effect):
+            trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
     direct = [_rounded(x, dataset.joints[x.joint]) for x in steps]
     direct += [_late(x, dataset.joints[x.joint]) for x in late]
@@ -205,8 +208,6 @@ def _cause(
         if c not in same and c.probability > 1e-3:
             name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
             others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
-    if pointless(effect):
-        trust *= known_probability(1.0, True)
     parameters = reported_parameters(effect, final, covariance)
     numbers = {k: v.value for k, v in parameters.items()}
     return Cause(

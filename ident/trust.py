@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ident.attribute import DETECTION_EXCESS, Attribution, Round, implausible
+from ident.extended import Effect, Prediction
 from ident.hypotheses import Hypothesis
 from ident.torque_fit import Fit, Problem
 from ident.verdict import Gain
@@ -16,6 +19,8 @@ CLOSED = 0.5  # share of the gap that the extended model must then close
 CARRIED = 0.8  # the same where it explains the data that it was fitted to down to the noise
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
 SHORT = 0.25  # by which the gap closed on held-out data may fall short of what the fitted ones promise
+RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
+LEAST_FOLLOWED = 0.1  # share of the path along which a ripple must lie in the compared band for its name to be trusted
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 
@@ -65,6 +70,22 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
     settled = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
     expected = 1.0 - np.sqrt(left)
     return gain.gap_closed < max(CARRIED if settled else CLOSED, expected - SHORT)
+
+
+def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect) -> bool:
+    """Whether a ripple lies beyond the compared band along nearly all the path of the motions.
+
+    What is left of it there is a turn or two where the joint creeps: that has many wave numbers.
+    """
+    names = [q.name for q in effect.hypothesis.parameters]
+    if not problem.motions_alone or RIPPLE not in names:
+        return False
+    slow = path = 0.0
+    for group, pred in zip(problem.groups, predictions, strict=True):
+        speed = np.abs(pred.motion(group).v(effect.hypothesis.joint)) * group.window
+        slow += float(np.sum(speed[effect.value(RIPPLE) * speed < group.omega[group.n_compared - 1]]))
+        path += float(np.sum(speed))
+    return slow < LEAST_FOLLOWED * path
 
 
 def collapsed(problem: Problem, final: Fit) -> bool:

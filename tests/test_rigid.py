@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from ident.attribute import plainer
 from ident.dataset import Dataset, Segment
 from ident.diagnose import diagnose_fully, set_up, with_held_out
-from ident.extended import Effect, Model
+from ident.extended import Effect, Model, predict
 from ident.graybox import LinkChange, Parameters, build_structure
 from ident.hypotheses import catalogue
 from ident.hypotheses.sensing import torque_offset
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, fit_rigid, regressor
 from ident.torque_fit import fit
+from ident.trust import too_fast
 from robot_assets.robot import Elasticity
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
@@ -201,3 +202,15 @@ def test_friction_whose_yielding_no_motion_shows_is_plain_friction(ur10, moved):
     assert {e.hypothesis.effect for e in named} == {"coulomb_friction"} and len(named) == ur10.n
     assert [e.value("torque") for e in named] == pytest.approx(COULOMB, rel=0.05)
     assert plainer(problem, fitted, known, {e.hypothesis.key for e in bristles}) is fitted
+
+
+def test_a_ripple_that_a_motion_runs_over_is_not_trusted(moved):
+    """Where the motion is faster than the compared band can follow, all but a turn or two of a ripple is out of it."""
+    problem = set_up(moved).problem
+    of = {h.key: h for h in catalogue(problem.structure)}
+    preds = [predict(Model(problem.structure, problem.nominal), g, problem.sampling) for g in problem.groups]
+    ripple = of["cogging", "wrist_3_joint"]
+    slow, fast = (too_fast(problem, preds, Effect(ripple, np.array([1.0, k, 0.0]))) for k in (5.0, 20000.0))
+    assert fast and not slow
+    rub = Effect(of["coulomb_friction", "wrist_3_joint"], np.array([1.0, 0.0, 1e-3]))
+    assert not too_fast(problem, preds, rub)
