@@ -214,9 +214,13 @@ def attribute(
         if current.chi2_per_dof > FAINT and not best.hypothesis.decoy:
             current, more = companions(problem, current, best, hypotheses)
             rounds += more
-        taken = {e.hypothesis.key for e in current.model.effects}
+        found = current.model.effects
+        current = plainer(problem, current, hypotheses, set())
+        rounds = renamed(rounds, found, current.model.effects)
+        taken = {e.hypothesis.key for e in (*found, *current.model.effects)}
         current = pruned(problem, current)
-        hypotheses = tuple(h for h in hypotheses if h.key not in taken)
+        loaded = any(effect == "payload" for effect, _ in taken)
+        hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     return Attribution(baseline, detected, p_value, kept, current, unknown)
@@ -231,10 +235,13 @@ def pruned(problem: Problem, current: Fit) -> Fit:
     std = dict(zip(current.names, np.sqrt(np.maximum(np.diag(current.covariance()), 0.0)), strict=True))
 
     def nothing(effect: Effect) -> bool:
+        if pointless(effect):
+            return True
         h = effect.hypothesis
-        known = [std[f"{h.effect}@{h.place}:{q.name}"] for q in h.parameters]
-        values = zip(h.parameters, effect.p, known, strict=True)
-        return all(s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in values if not q.nuisance and q.null is None)
+        own = [(q, v, std[f"{h.effect}@{h.place}:{q.name}"]) for q, v in zip(h.parameters, effect.p, strict=True) if not q.nuisance]
+        off = [abs(q.to_internal(v) - q.to_internal(q.null)) / s for q, v, s in own if q.null is not None]
+        sizes = [s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in own if q.null is None]
+        return all(sizes) if sizes else all(x < ABSENT for x in off)
 
     effects = current.model.effects
     needed = tuple(e for e in effects if e.hypothesis.options.get("baseline") or not nothing(e))
@@ -302,6 +309,18 @@ def companions(
     return last, rounds
 
 
+def renamed(rounds: Sequence[Round], before: Sequence[Effect], after: Sequence[Effect]) -> list[Round]:
+    """Rounds whose winners have been replaced by their special cases, effect by effect."""
+    new = {a.hypothesis.key: b.hypothesis for a, b in zip(before, after, strict=True) if a.hypothesis is not b.hypothesis}
+
+    def of(found: Round) -> Round:
+        first, *others = found.candidates
+        h = new.get(first.hypothesis.key, first.hypothesis)
+        return replace(found, candidates=(replace(first, hypothesis=h), *others))
+
+    return [of(r) for r in rounds]
+
+
 def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kept: set[tuple[str, str]]) -> Fit:
     """The model with the special case in place of effects of which the data do not show what sets them apart from it.
 
@@ -316,7 +335,8 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
         special = known.get((h.options.get("absorbs", ""), h.place))
         if h.key in kept or special is None or "apart" not in h.options:
             return effect
-        if std[f"{h.effect}@{h.place}:{h.options['apart']}"] < UNTOLD:
+        hidden = h.options.get("give", lambda p: np.inf)(effect.p) < problem.q_std[h.joint]
+        if std[f"{h.effect}@{h.place}:{h.options['apart']}"] < UNTOLD and not hidden:
             return effect
         return Effect(special, clip_to_bounds(special, h.options["special"](effect.p)))
 
@@ -325,8 +345,9 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
     if not swapped:
         return result
     other = polish(problem, replace(result, model=replace(result.model, effects=effects)))
-    scale = max(1.0, result.cost / result.count)
-    return other if other.cost - result.cost < swapped * MIN_EVIDENCE * scale else result
+    same = reweighted(problem, result, other.weights)
+    scale = max(1.0, same.cost / same.count)
+    return other if other.cost - same.cost < swapped * MIN_EVIDENCE * scale else result
 
 
 def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:

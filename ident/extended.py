@@ -285,9 +285,7 @@ def _inner_torques(
         if effect.hypothesis.channel == "link":
             others = at_link.get(j, 0.0)
             guess = old_link[..., c] - others
-            options, free = effect.hypothesis.options, solution.Q_a[..., c] + compliance * guess
-            free[:, 0] -= options.get("rest", lambda p: 0.0)(effect.p)
-            at_link[j] = others + _loop(options["loop"](effect.p), grid, free, modes, guess)
+            at_link[j] = others + _loop(effect.hypothesis.options["loop"](effect.p), grid, solution.Q_a[..., c] + compliance * guess, modes, guess)
         else:
             others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])

@@ -164,9 +164,12 @@ class Motion:
 
     def asked(self, joint: int) -> np.ndarray:
         """Torque that the record leaves to a friction of the motor, N m."""
-        s, x = 1j * self.group.omega[:, None], self.solution
-        linear = (s**2 * self.par.inertia + s * self.par.viscous) * x.Q + x.tau_s @ self.par.coupling
-        return self._time(self.group.U - linear - self.beside, joint)
+        s, x = 1j * self.group.omega, self.solution
+        linear = (s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) * x.Q[..., joint]
+        carried = x.tau_s @ self.par.coupling[:, joint]
+        others = self.beside[..., joint] if isinstance(self.beside, np.ndarray) else self.beside
+        left = self.group.U[..., joint] - linear - carried - others
+        return self.group.to_time(left[..., None])[..., 0]
 
     @property
     def time(self) -> np.ndarray:

@@ -119,8 +119,18 @@ class Fit:
         return self.cost / max(self.count - len(self.names), 1)
 
     def covariance(self) -> np.ndarray:
-        """(p, p) of the fitted coordinates, scaled by the misfit where that exceeds one; large where the data say nothing."""
-        return inverse(self.information, RIDGE) * max(1.0, self.chi2_per_dof)
+        """(p, p) of the fitted coordinates, scaled by the misfit where that exceeds one.
+
+        With what is known before the data: a parameter that they do not feel keeps that spread.
+        """
+        m = len(self.model.par.to_log())
+        known = [
+            q.expected_spread(v) ** -2 if q.log or q.bounded else 0.0
+            for effect in self.model.effects
+            for q, v in zip(effect.hypothesis.parameters, effect.p, strict=True)
+        ]
+        prior = np.concatenate([np.full(m, PRIOR_LOG_STD**-2), [0.0], known])
+        return inverse(self.information / max(1.0, self.chi2_per_dof) + np.diag(prior), RIDGE)
 
 
 def inverse(H: np.ndarray, ridge: float) -> np.ndarray:

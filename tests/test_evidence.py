@@ -25,7 +25,7 @@ from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.torque_fit import RIDGE, inverse, joint_costs, predictions, weighted_cost
+from ident.torque_fit import PRIOR_LOG_STD, RIDGE, inverse, joint_costs, predictions, weighted_cost
 from ident.verdict import Gain
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
@@ -238,3 +238,10 @@ def test_a_coordinate_that_the_data_do_not_feel_has_a_large_deviation():
     C = inverse(H, RIDGE)
     assert np.allclose(C[:2, :2] * np.outer([1e6, 1e-3], [1e6, 1e-3]), np.linalg.inv(H[:2, :2]) * np.outer([1e6, 1e-3], [1e6, 1e-3]), rtol=1e-3)
     assert C[2, 2] > 1e12
+
+
+def test_what_the_data_do_not_feel_keeps_its_spread_before_them(identified):
+    _, _, result = identified
+    nothing = replace(result, information=0.0 * result.information)
+    std = np.sqrt(np.diag(nothing.covariance()))[: len(result.model.par.to_log())]
+    assert std == pytest.approx(PRIOR_LOG_STD)

@@ -156,6 +156,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             "absorbs": "coulomb_friction",
             "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0]]),
             "apart": "stiffness",
+            "give": lambda p: p[1] / p[0],
             "special": lambda p: np.array([p[1], 0.0, SHARP]),
         },
     )

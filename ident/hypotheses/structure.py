@@ -38,7 +38,6 @@ from robot_assets.robot import Elasticity
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
 SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
 STIFFEST = 1e12  # N m/rad, of a hinge
-REST_SPREAD = 0.5  # of the rest of a cable bundle about zero, rad or m
 FARTHEST_REST = 10.0  # of a balancing spring, rad or m
 MOST_TILT = 3.0  # of an elastic axis towards each other axis, in units of that along the one from which it is sought
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
@@ -124,22 +123,16 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
 
 
 def dress_pack(joint: int, place: str) -> Hypothesis:
-    """Cable bundle on the link side: ``stiffness (q_link - rest_angle) + friction sign(q_link')``.
-
-    Where it hangs free is the bundle's own: zero by the catalogue, and near it before the data.
-    """
+    """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v_link(j)
         turn = 0.02 * float(np.sqrt(np.mean(v**2)))
 
         def start(c):
-            if max(c[0], c[1]) <= 0:
-                return None
-            rest = np.clip(-c[2] / c[0], -1.0, 1.0) if c[0] > 0 else 0.0
-            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), turn, rest])
+            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), turn]) if max(c[0], c[1]) > 0 else None
 
-        return Screen((motion.q_link(j), direction(v, turn), np.ones_like(v)), start)
+        return Screen((motion.q_link(j), direction(v, turn)), start)
 
     return Hypothesis(
         "dress_pack",
@@ -150,7 +143,6 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
             Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True, step=1e-3),
             Parameter("friction", "N m", 1e-9, 1e7, log=True, step=1e-3),
             SMOOTHING,
-            Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, step=1e-3, center=0.0, spread=REST_SPREAD, null=0.0),
         ),
         None,
         lambda scale: [()],
@@ -159,11 +151,10 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
         variable="q",
         options={
             "loop": lambda p: (kernels.LINK, p[0], p[1], p[2]),
-            "rest": lambda p: p[3],
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the motor.
             "trivial": lambda p: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
-            "absorb": lambda p, weights, old: np.array([old[0], p[1], p[2], old[1]]),
+            "absorb": lambda p, weights, old: np.array([old[0], p[1], p[2]]),
         },
     )
 
@@ -171,11 +162,11 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
 def payload(link: str) -> Hypothesis:
     """Unknown load with its centre of mass at ``com`` in the frame of the flange's link.
 
-    ``inertia`` about the centre is that of a ball: what the data see of a compact load beyond a point.
+    Its inertia about the centre is that of a body along the axes of the frame: what a ball would leave, a wrong link takes up.
     """
 
     def change(p) -> Change:
-        return Change(loads=((link, pin.Inertia(float(p[0]), np.asarray(p[1:4], float), p[4] * np.eye(3))),))
+        return Change(loads=((link, pin.Inertia(float(p[0]), np.asarray(p[1:4], float), np.diag(p[4:7]))),))
 
     def responses(structure, par, plane, group, solution, shape):
         joint, placement = structure.bodies[link]
@@ -185,7 +176,7 @@ def payload(link: str) -> Hypothesis:
     def start(c):
         if c[0] <= 0:
             return None
-        return np.concatenate([[c[0]], np.clip(c[1:] / c[0], -0.4, 0.4), [c[0] * SMALL_LOAD**2]])
+        return np.concatenate([[c[0]], np.clip(c[1:] / c[0], -0.4, 0.4), np.full(3, c[0] * SMALL_LOAD**2)])
 
     return Hypothesis(
         "payload",
@@ -197,7 +188,7 @@ def payload(link: str) -> Hypothesis:
             Parameter("com_x", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
             Parameter("com_y", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
             Parameter("com_z", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
-            Parameter("inertia", "kg m2", 1e-9, 1e4, log=True, step=1e-1),
+            *(Parameter(f"inertia_{i}", "kg m2", 1e-9, 1e4, log=True, step=1e-1) for i in "xyz"),
         ),
         None,
         lambda scale: [()],
@@ -251,6 +242,7 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False) -> Hyp
         variable="posture",
         options={
             "nats": -LOAD_NATS if carries_load else 0.0,
+            "carries_load": carries_load,  # what it carries and its own body are one to the data
             "change": lambda p: Change(links=((link, how(p)),)),
             "responses": responses,
             "start": lambda c: np.array(

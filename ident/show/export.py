@@ -133,7 +133,8 @@ def _hidden_hinge(index: int, cause: Cause) -> Elasticity:
 def _payload(robot: Robot, cause: Cause) -> tuple[str, pin.Inertia]:
     p = {k: v.value for k, v in cause.parameters.items()}
     com = np.array([p["com_x"], p["com_y"], p["com_z"]])
-    return robot.payload_link, pin.Inertia(p["mass"], com, p.get("inertia", 0.0) * np.eye(3))
+    own = np.diag([p.get(f"inertia_{i}", 0.0) for i in "xyz"])
+    return robot.payload_link, pin.Inertia(p["mass"], com, own)
 
 
 def _link_change(cause: Cause) -> LinkChange:
