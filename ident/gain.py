@@ -13,12 +13,16 @@ from ident.torque_fit import Problem, noise_covariance
 from ident.verdict import Gain
 
 METRIC = "RMS motor-torque prediction error, N m"
+STRETCHES = 8  # of a motion
 RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean squared torque error of each segment and joint, N2 m2; each (segments, n)."""
+    """Mean squared torque error of each segment, or each stretch of a motion, and joint, N2 m2; each (rows, n).
+
+    ``segments``: of the rows, a motion as often as it has stretches.
+    """
 
     segments: tuple[str, ...]
     before: np.ndarray
@@ -32,8 +36,10 @@ def segment_errors(
     """Prediction errors in the compared band, before and after, and the noise in it.
 
     Along a motion too large for a model its links cannot be solved; such a group is left out of the
-    errors of both models, and of the pairs of predictions.
+    errors of both models, and of the pairs of predictions. Where there are motions alone, each is cut into
+    ``STRETCHES``: one of them says by its parts how much chance there is in what is gained.
     """
+    parts = STRETCHES if all(group.window is not None for group in groups) else 1
     names: list[str] = []
     out: list[list[np.ndarray]] = [[], [], []]
     pairs = []
@@ -47,11 +53,11 @@ def segment_errors(
         S = noise_covariance(problem, group, b)
         share = 1.0 if group.window is None else float(np.mean(group.window**2))
         noise = share * np.einsum("kii->ki", S).real
-        names += group.segments
+        names += [name for name in group.segments for _ in range(parts)]
         for store, pred in ((out[0], a), (out[1], b)):
             e = group.observe(group.U - pred.U)
-            store.append(mean_squares(np.abs(e) ** 2) / share)
-        out[2].append(np.repeat(mean_squares(noise[None]) / share, len(group.segments), axis=0))
+            store.append((mean_squares(np.abs(e) ** 2) if parts == 1 else stretch_squares(group, e, parts)) / share)
+        out[2].append(np.repeat(mean_squares(noise[None]) / share, parts * len(group.segments), axis=0))
     joined = (np.concatenate(x) if x else np.zeros((0, len(problem.nominal.stiffness))) for x in out)
     return Errors(tuple(names), *joined), pairs
 
@@ -59,6 +65,17 @@ def segment_errors(
 def mean_squares(lines: np.ndarray) -> np.ndarray:
     """Mean squares (S, n) of signals from the squared moduli (S, K, n) of their lines, line 0 first."""
     return lines[:, 0] + 2 * lines[:, 1:].sum(axis=1)
+
+
+def stretch_squares(group: Group, lines: np.ndarray, parts: int) -> np.ndarray:
+    """Mean squares (parts, n) of a windowed motion from its lines (1, K, n), by stretches of time; their mean is that of the whole."""
+    full = np.zeros((1, len(group.omega), lines.shape[2]), complex)
+    full[:, : lines.shape[1]] = lines
+    squares = group.to_time(full)[0] ** 2
+    inside = int(np.flatnonzero(group.window).max()) + 1
+    edges = np.linspace(0, inside, parts + 1).astype(int)
+    edges[-1] = len(squares)
+    return np.add.reduceat(squares, edges[:-1], axis=0) * parts / len(squares)
 
 
 def measure_gain(
@@ -71,7 +88,7 @@ def measure_gain(
 ) -> Gain | None:
     """Rms errors, share of the gap to the noise floor that is closed, and its 95 % interval.
 
-    The interval is a percentile bootstrap over segments. None where no segment could be predicted.
+    The interval is a percentile bootstrap over segments, or over stretches of motions. None where no segment could be predicted.
 
     Args:
         affected: the joints over which errors are taken: those that carry the discrepancy in the
@@ -99,5 +116,5 @@ def measure_gain(
         ratio = (b - a) / np.maximum(b - f, 1e-300)
         interval = tuple(float(v) for v in np.quantile(ratio, [0.025, 0.975]))
     return Gain(
-        errors.segments, metric, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints)
+        tuple(dict.fromkeys(errors.segments)), metric, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints)
     )

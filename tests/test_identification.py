@@ -106,4 +106,4 @@ def test_a_ripple_that_is_fast_along_a_motion_does_not_fold_into_its_band(ur10):
     rippled = replace(bare, effects=(Effect(h, np.array([values[q.name] for q in h.parameters])),))
     (motion,) = (g for g in setup.held_out if g.window is not None)
     errors, _ = segment_errors(setup.problem, (motion,), bare, rippled)
-    assert np.sqrt(errors.after[0, 2]) < 0.2 * np.sqrt(errors.before[0, 2])
+    assert np.sqrt(errors.after[:, 2].mean()) < 0.2 * np.sqrt(errors.before[:, 2].mean())

@@ -9,6 +9,7 @@ import pytest
 from ident.dataset import Dataset, Segment
 from ident.diagnose import diagnose, set_up
 from ident.extended import Model, predict
+from ident.gain import mean_squares, stretch_squares
 from ident.records import close_motion
 from ident.torque_fit import data_count, make_weights
 from robot_assets.robot import load_robot
@@ -93,4 +94,10 @@ def test_friction_at_rest_is_what_the_drive_asks_of_it(tmp_path):
     assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("coulomb_friction", "drive")]
     found = verdict.causes[0].parameters
     assert found["torque"].value == pytest.approx(size, rel=0.02) and abs(found["asymmetry"].value) < 0.05
-    assert verdict.gain.gap_closed > 0.85
+    assert verdict.gain.gap_closed > 0.85 and verdict.gain.segments == ("b",)
+    low, high = verdict.gain.ci95
+    assert 0.7 < low < verdict.gain.gap_closed < high <= 1.01
+    (group,) = set_up(data).held_out
+    lines = group.observe(group.U)
+    parts = stretch_squares(group, lines, 8)
+    assert parts.shape == (8, 1) and parts.mean(axis=0) == pytest.approx(mean_squares(np.abs(lines) ** 2)[0], rel=1e-9)
