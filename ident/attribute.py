@@ -214,10 +214,10 @@ def attribute(
         if current.chi2_per_dof > FAINT and not best.hypothesis.decoy:
             current, more = companions(problem, current, best, hypotheses)
             rounds += more
-        found = current.model.effects
+        effects = current.model.effects
         current = plainer(problem, current, hypotheses, set())
-        rounds = renamed(rounds, found, current.model.effects)
-        taken = {e.hypothesis.key for e in (*found, *current.model.effects)}
+        rounds = renamed(rounds, effects, current.model.effects)
+        taken = {e.hypothesis.key for e in (*effects, *current.model.effects)}
         current = pruned(problem, current)
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))

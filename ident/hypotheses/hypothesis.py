@@ -109,10 +109,11 @@ class Hypothesis:
             to start from where no linear step leads there. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
             place of one with parameters ``old`` at the same joint. ``apart``: the parameter that sets it apart from that
-            special case, and ``special(p)`` the parameters of the special case that it is where the data do not show this one, or where ``give(p)``, rad, is less than the noise of
-            the position. ``essential`` names the parameter without
+            special case, and ``special(p)`` the parameters of the special case that it is where the data do not show this
+            one, or where ``give(p)``, rad, is less than the noise of the position. ``essential`` names the parameter without
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm
-            may have several steady motions with it. ``dry``: a friction that at rest balances what is asked of it. ``nats``: log odds before the data, 0 where there is no reason.
+            may have several steady motions with it. ``dry``: a friction that at rest balances what is asked of it.
+            ``nats``: log odds before the data, 0 where there is no reason.
             ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
     """
 
