@@ -29,6 +29,8 @@ BLOCKS = 8  # stretches of time, of which the jackknife leaves one out
 LONGEST = 2000  # instants that an estimate of skew looks at
 RANK = 1e-6  # of the largest singular value, below which columns tell the same
 EXPLAINED = 0.9  # share of the torque that must be explained for its skew to mean anything
+GONE = 0.3  # share of what is unexplained without a skew that must go with it
+SURE = 8.0  # deviations of a skew, of eight stretches of time: one in ten thousand by chance (Student's t)
 ONE_JOINT = 0.5  # share of a skew that may go with one joint
 MOVES = 3.0  # standard deviation of a position over its noise
 LOW_SHARE = 0.1  # of the sample rate
@@ -44,7 +46,7 @@ class Skew:
 
     @property
     def sure(self) -> bool:
-        return bool(np.isfinite(self.late) and abs(self.late) > 4 * self.std)
+        return bool(np.isfinite(self.late) and abs(self.late) > SURE * self.std)
 
 
 UNKNOWN = Skew(np.nan, np.nan)
@@ -182,7 +184,8 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
     All joints together, as one channel of torques is sampled at one time: torque is a linear combination
     of the rigid-body regressor, of motor inertia and of friction. Samples of slow joints, where friction
     has memory, are left out. The deviation is that of a jackknife over ``BLOCKS`` stretches of time. A shift that
-    is gone without one of the joints is no skew of the channels, but an effect of that joint.
+    leaves most of what was unexplained stands for something else, such as a gear with lost motion, and one
+    that is gone without one of the joints is no skew of the channels, but an effect of that joint.
     It is a cross-correlation in which inertia, gravity and friction have their place.
     """
     rate, n = dataset.sample_rate, dataset.n
@@ -204,10 +207,12 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
     block = np.repeat(np.arange(len(pick)) * BLOCKS // len(pick), n)[rows]
     A = B.reshape(-1, B.shape[2])
     late, time = 0.0, np.arange(len(tau)) / rate
+    unexplained = []
     for _ in range(8):
         y = np.stack([np.interp(time[pick] + late, time, x) for x in tau.T], axis=1) / scale
         x = np.linalg.lstsq(A[rows], y.ravel()[rows], rcond=RANK)[0]
         fit = (A @ x).reshape(y.shape)
+        unexplained.append(float(np.sum((y - fit).ravel()[rows] ** 2)))
         slope = np.gradient(fit, every / rate, axis=0).ravel()[rows]
         step = _shift(A[rows], slope, y.ravel()[rows])
         late = late - step
@@ -215,11 +220,12 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
             return UNKNOWN
         if abs(step) < 1e-6:
             break
-    explained = 1 - np.sum((y - fit).ravel()[rows] ** 2) / np.sum((y - y.mean(axis=0)).ravel()[rows] ** 2)
-    if explained < EXPLAINED:
+    if unexplained[-1] > (1.0 - EXPLAINED) * np.sum((y - y.mean(axis=0)).ravel()[rows] ** 2):
         return UNKNOWN
     parts = np.array([_shift(A[rows][block != k], slope[block != k], y.ravel()[rows][block != k]) for k in range(BLOCKS)])
     skew = Skew(float(late), float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2))))
+    if skew.sure and unexplained[-1] > (1.0 - GONE) * unexplained[0]:
+        return UNKNOWN
     at = np.tile(np.arange(n), len(pick))[rows]
     for j in range(n) if skew.sure and n > 1 else ():
         others = at != j

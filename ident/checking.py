@@ -24,6 +24,7 @@ from robot_assets.robot import linear_joints
 CHECKS = (unit_warnings, stuck_warnings, lost_sample_warnings, skew_warnings, excitation_warnings, torque_warnings)
 MOST = 40  # warnings shown
 SHOWN = 12  # segments listed one by one
+BRIEF = 5.0  # s of motion in all, below which inertia, gravity and friction hardly get apart
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,7 @@ def _warnings(dataset: Dataset) -> list[str]:
         out.append("no validation segments: the gain will be measured by leaving operating points out")
     if not any(s.role == "identification" for s in dataset.segments):
         out.append("no identification segments: there is nothing to fit")
+    out += _brief_warnings(dataset)
     alike: dict[str, list[str]] = {}
     for s in dataset.segments:
         found = [w for check in CHECKS for w in check(s, dataset)]
@@ -163,6 +165,17 @@ def _warnings(dataset: Dataset) -> list[str]:
     for same in alike.values():
         out.append(same[0] + (f" (so in {len(same)} segments)" if len(same) > 1 else ""))
     return out[:MOST]
+
+
+def _brief_warnings(dataset: Dataset) -> list[str]:
+    """Motions too short in all to tell causes apart."""
+    fitted = [s for s in dataset.segments if s.role == "identification"]
+    if not fitted or any(s.kind != "trajectory" for s in fitted):
+        return []
+    seconds = sum(s.n_samples for s in fitted) / dataset.sample_rate
+    if seconds >= BRIEF:
+        return []
+    return [f"{seconds:.3g} s of motion to fit in all, less than {BRIEF:g} s: inertia, gravity and friction hardly get apart, and causes even less"]
 
 
 def _joint(warning: str) -> str:

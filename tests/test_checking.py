@@ -215,3 +215,25 @@ def test_longer_and_longer_steps_are_no_lost_samples():
     gone = np.delete(smooth, np.arange(200, 3800, 300), axis=0)
     cut = replace(s, q=gone, tau=0.1 * gone, t=np.arange(len(gone)) / 1000.0)
     assert any("dropped" in w for w in lost_sample_warnings(cut, dataset(robot, cut)))
+
+
+def test_a_log_too_short_to_tell_causes_apart_is_said_to_be(arm, log):
+    cut = replace(log, **log.part(slice(0, int(1.5 * RATE))))
+    short = inspect_dataset(dataset(arm, cut)).warnings
+    assert any("1.5 s of motion to fit in all" in w for w in short), short
+    for segments in ((log,), (cut, log)):
+        assert not any("of motion to fit in all" in w for w in inspect_dataset(dataset(arm, *segments)).warnings)
+
+
+def test_lost_motion_of_a_gear_is_no_skew_of_the_channels():
+    """Friction that follows the motion late, by a twentieth of the stroke at each turn."""
+    false = 0
+    for name in ("emps", "ur10_bare", "panda_bare"):
+        robot = load_robot(name)
+        for seed in range(4):
+            s = recording(robot, np.random.default_rng(seed))
+            width, z = 0.05 * np.ptp(s.q, axis=0), np.zeros(robot.n)
+            followed = [z := np.clip(z + step / width, -1, 1) for step in np.diff(s.q, axis=0, prepend=s.q[:1])]
+            bent = replace(s, tau=s.tau + 0.1 * s.tau.std(axis=0) * np.array(followed))
+            false += torque_skew(bent, dataset(robot, bent)).sure
+    assert false == 0
