@@ -512,11 +512,13 @@ def explore_softly(
     """
     stage, level = soften(problem, current)
     found, scores = explore(problem, stage, hypotheses, 0.0, workers, rough=True)
-    softly = {h.key: explained(stage, r, noise=0.0) for h, r in found[:FINALISTS]}
+    # Of laws of which nothing is left but a special case, that one goes on.
+    last = [(h, r) for h, r in found if not pointless(r.model.effects[-1])][:FINALISTS]
+    softly = {h.key: explained(stage, r, noise=0.0) for h, r in last}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
-    ways = [(h, r, (*ladder, sharp)) for h, r in found[:FINALISTS]]
+    ways = [(h, r, (*ladder, sharp)) for h, r in last]
     ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
 
     def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> Fit | None:

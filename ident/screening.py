@@ -20,6 +20,11 @@ from ident.torque_fit import Fit, Problem, as_real, jacobian, observe_columns, r
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
+WAVE_STEPS = 259, 2000  # steps of that search: for periodic records, and at most
+WAVES_AT_ONCE = 260
+FEWEST = 20  # samples in which a wave must lie in the compared band
+FOLLOWED = 0.1  # share of the path of a motion along which a ripple must, for its wave number to be looked for
+REFINED_SAMPLES = 3000  # that wave numbers are refined with
 
 
 @dataclass(frozen=True)
@@ -273,73 +278,124 @@ def position_lines(
     weights of their own in every posture, so that no phase has to be carried between postures;
     then the best ones are refined with one phase for all.
     """
-    qs, rs, groups = [], [], []
-    for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
-        motion = pred.motion(group)
-        q = motion.q(joint)
-        R = (group.U - pred.U)[..., joint : joint + 1].copy()
-        R[:, group.n_compared :] = 0.0
-        r = group.to_time(R)[..., 0]
-        step = max(1, q.shape[1] // 600)
-        v, a = motion.v(joint), motion.acceleration(joint)
-        for s in range(len(q)):
-            nuisance = np.stack(
-                [np.ones_like(v[s]), q[s] - q[s].mean(), v[s], a[s], np.sign(v[s])], axis=1
-            )[::step]
-            nuisance = np.linalg.qr(nuisance / np.maximum(np.linalg.norm(nuisance, axis=0), 1e-300))[0]
-            x = r[s, ::step]
-            qs.append((q[s, ::step], nuisance))
-            rs.append(x - nuisance @ (nuisance.T @ x))
-            groups.append(g)
-    spans = [np.ptp(q) for q, _ in qs]
-    if max(spans) <= 0:
+    records = _loudest(problem, predictions, joint)
+    span = max((np.ptp(x.q) for x in records), default=0.0)
+    if span <= 0:
         return ()
-    order = np.argsort([-float(r @ r) for r in rs])
-    each = max(2, PERIODOGRAM_RECORDS // len(problem.groups))
-    loudest = [i for g in range(len(problem.groups)) for i in [k for k in order if groups[k] == g][:each]]
-    qs, rs = [qs[i] for i in loudest], [rs[i] for i in loudest]
-    spans = [spans[i] for i in loudest]
-    step = 0.7 * np.pi / max(spans)
-    coarse = step * np.arange(1, 260)
-    power = np.zeros(len(coarse))
-    for (q, N), r in zip(qs, rs, strict=True):
-        E = np.multiply(*_waves(q - q.mean(), step, step, len(coarse))).reshape(len(q), -1)[:, : len(coarse)]
-        E = E - N @ (N.T @ E)
-        sizes = np.einsum("tk,tk->k", E, E.conj()).real, np.einsum("tk,tk->k", E, E)
-        power += _fall(*sizes, r @ E, 1e-9 * len(r) ** 2)
-    total = sum(float(r @ r) for r in rs)
+    step = 0.7 * np.pi / span
+    steps = int(np.clip(max(x.highest() for x in records) / step, *WAVE_STEPS))
+    coarse = step * np.arange(1, steps + 1)
+    power = sum(_own_power(x, step, steps) for x in records)
+    total = sum(float(x.residual @ x.residual) for x in records)
     best: list[float] = []
     for k in np.argsort(-power):
         if all(abs(coarse[k] - b) > 2.5 * step for b in best):
             best.append(float(coarse[k]))
         if len(best) == count or power[k] < 1e-3 * total:
             break
-    return tuple(f for n in best for f in _refine(qs, rs, n, step))
+    return tuple(f for n in best for f in _refine(records, n, step))
 
 
-def _refine(qs, rs, center: float, width: float, count: int = 4) -> list[float]:
+@dataclass(frozen=True)
+class _Record:
+    """Residual torque of a joint over its motor angle, samples of one record.
+
+    ``q``, ``residual`` (T,), the latter without what ``nuisance`` (T, m), orthonormal, explains; ``speed`` (T,) rad/s;
+    ``top`` rad/s: frequency up to which a motion is compared, infinite for periodic records.
+    """
+
+    q: np.ndarray
+    speed: np.ndarray
+    nuisance: np.ndarray
+    residual: np.ndarray
+    top: float
+
+    def highest(self) -> float:
+        """Wave number beyond which a ripple lies in the compared band only where the joint creeps."""
+        if np.isinf(self.top):
+            return 0.0
+        # Speed below which a tenth of the path is made.
+        order = np.sort(self.speed)
+        slow = order[np.searchsorted(np.cumsum(order), FOLLOWED * order.sum())]
+        return float(self.top / max(slow, 1e-300))
+
+
+def _loudest(problem: Problem, predictions: Sequence[Prediction], joint: int) -> list[_Record]:
+    """The records of every group in which most of a joint's torque is unexplained."""
+    each, out = max(2, PERIODOGRAM_RECORDS // len(problem.groups)), []
+    for group, pred in zip(problem.groups, predictions, strict=True):
+        motion = pred.motion(group)
+        R = (group.U - pred.U)[..., joint : joint + 1].copy()
+        R[:, group.n_compared :] = 0.0
+        signals = (motion.q(joint), motion.v(joint), motion.acceleration(joint), group.to_time(R)[..., 0])
+        if group.window is None:
+            pick, top = np.arange(0, signals[0].shape[1], max(1, signals[0].shape[1] // 600)), np.inf
+        else:
+            # The return that closes a motion was not recorded.
+            inside = np.flatnonzero(group.window > 0.5)
+            pick, top = inside[:: max(1, len(inside) // max(600, 3 * group.n_compared))], float(group.omega[group.n_compared - 1])
+        records = []
+        for q, v, a, r in zip(*(x[:, pick] for x in signals), strict=True):
+            known = np.stack([np.ones_like(v), q - q.mean(), v, a, np.sign(v)], axis=1)
+            known = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))[0]
+            records.append(_Record(q, np.abs(v), known, r - known @ (known.T @ r), top))
+        out += sorted(records, key=lambda x: -float(x.residual @ x.residual))[:each]
+    return out
+
+
+def _own_power(x: _Record, step: float, count: int) -> np.ndarray:
+    """Fall of the squared residual of a record by waves at multiples of ``step``, each where it lies in the compared band."""
+    power = np.zeros(count)
+    for first in range(1, count + 1, WAVES_AT_ONCE):
+        n = step * np.arange(first, min(first + WAVES_AT_ONCE, count + 1))
+        seen = x.speed * n[0] <= x.top
+        if seen.sum() < FEWEST:
+            break
+        q, N, r = x.q[seen], x.nuisance[seen], x.residual[seen]
+        E = np.multiply(*_waves(q - x.q.mean(), n[0], step, len(n))).reshape(len(q), -1)[:, : len(n)]
+        if np.isfinite(x.top):
+            E = E * (x.speed[seen][:, None] * n <= x.top)
+        sizes = np.einsum("tk,tk->k", E, E.conj()).real, np.einsum("tk,tk->k", E, E)
+        along = N.T @ E
+        # What is known beforehand is orthonormal over all samples, of which a wave may have a part.
+        sizes = sizes[0] - np.einsum("mk,mk->k", along, along.conj()).real, sizes[1] - np.einsum("mk,mk->k", along, along)
+        power[first - 1 : first - 1 + len(n)] = _fall(*sizes, r @ E, 1e-9 * len(r) ** 2)
+    return power
+
+
+def _refine(records: Sequence[_Record], center: float, width: float, count: int = 4) -> list[float]:
     """Best wave numbers near ``center`` with one phase for all records.
 
     Postures far apart leave a comb of nearly equal maxima; the best of them are all returned.
     """
-    spread = np.ptp([q.mean() for q, _ in qs]) + np.ptp(qs[0][0])
+    spread = np.ptp([x.q.mean() for x in records]) + np.ptp(records[0].q)
     count_fine = int(np.clip(6 * width * spread, 41, 1500))
     first, step = center - 1.5 * width, 3.0 * width / (count_fine - 1)
-    power = _coherent_power(qs, rs, first, step, count_fine)
+    q, r = _joined(records, center)
+    power = _coherent_power(q, r, first, step, count_fine)
     peaks = np.flatnonzero((power >= np.roll(power, 1)) & (power >= np.roll(power, -1)))
     out = []
     for k in peaks[np.argsort(-power[peaks])][:count]:
         nearest = first + (k - 1) * step
-        near = _coherent_power(qs, rs, nearest, step / 20, 41)
+        near = _coherent_power(q, r, nearest, step / 20, 41)
         out.append(float(nearest + np.argmax(near) * step / 20))
     return out
 
 
-def _coherent_power(qs, rs, first: float, step: float, count: int) -> np.ndarray:
+def _joined(records: Sequence[_Record], wave_number: float) -> tuple[np.ndarray, np.ndarray]:
+    """Motor angle and residual of all records where a wave lies in the compared band, some thousand samples."""
+    most = max(250, REFINED_SAMPLES // len(records))
+    q, r = [], []
+    for x in records:
+        seen = np.flatnonzero(x.speed * wave_number <= x.top)
+        seen = seen[:: max(1, len(seen) // most)]
+        q.append(x.q[seen])
+        r.append(x.residual[seen])
+    return np.concatenate(q), np.concatenate(r)
+
+
+def _coherent_power(q: np.ndarray, r: np.ndarray, first: float, step: float, count: int) -> np.ndarray:
     """Fall of the squared residual by a sine and a cosine of each wave number, one phase for all records."""
-    strides = [max(1, len(q) // 250) for q, _ in qs]
-    q = np.concatenate([q[::k] for (q, _), k in zip(qs, strides, strict=True)])
-    r = np.concatenate([r[::k] for r, k in zip(rs, strides, strict=True)])
     coarse, fine = (x.reshape(len(q), -1) for x in _waves(q, first, step, count))
     square = ((coarse**2).T @ fine**2).ravel()[:count]
     moment = ((coarse * r[:, None]).T @ fine).ravel()[:count]
