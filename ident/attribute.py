@@ -64,6 +64,7 @@ NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, ab
 MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place: share of the highest resonance tried, damping
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent
+ABSENT_LEVEL = 2.7e-3  # the same of several together, as a probability
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
 MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
 STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
@@ -71,6 +72,7 @@ POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found abs
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
+REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
 WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: linear steps understate strong effects
 WORTH_A_REFIT_FAINT = 0.1  # the same where what is left is faint
@@ -219,11 +221,59 @@ def attribute(
         rounds = renamed(rounds, effects, current.model.effects)
         taken = {e.hypothesis.key for e in (*effects, *current.model.effects)}
         current = pruned(problem, current)
+        # A special case of what is there already would only share its size with it.
+        taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in current.model.effects}
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
+    current, rounds = rematched(problem, current, rounds, workers)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     return Attribution(baseline, detected, p_value, kept, current, unknown)
+
+
+def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> tuple[Fit, list[Round]]:
+    """Causes against their rivals once more, beside all that was found after them.
+
+    In the round in which a cause is named those still missing blur what sets it apart from its rivals.
+    """
+    out = []
+    for found in rounds:
+        winner = found.candidates[0].hypothesis
+        there = {e.hypothesis.key for e in current.model.effects}
+        if len(there) > 1 and winner.key in there and not winner.decoy and not workers.late:
+            current, found = contest(problem, current, found, workers)
+        out.append(found)
+    return current, out
+
+
+def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> tuple[Fit, Round]:
+    """The winner of a round and its rivals, each fitted in its place: the model with the best of them, and the round."""
+    effects = current.model.effects
+    there = {e.hypothesis.key for e in effects}
+    winner = found.candidates[0].hypothesis
+    others = tuple(e for e in effects if e.hypothesis.key != winner.key)
+    own = next(e for e in effects if e.hypothesis.key == winner.key)
+    rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and c.hypothesis.key not in there]
+
+    def entered(effect: Effect) -> Fit | None:
+        model = replace(current.model, effects=(*others, effect))
+        return refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
+
+    entrants = [own, *rivals[:FINALISTS]] if rivals else []
+    fits = workers.map_in_time(entered, entrants, lambda e: f"again: {e.hypothesis.effect} at {e.hypothesis.place}")
+    ran = [Candidate(e.hypothesis, r, 0.0) for e, r in zip(entrants, fits, strict=True) if r is not None]
+    if len(ran) < 2 or ran[0].hypothesis is not own.hypothesis:
+        return current, found
+    weighed = weigh(ran, max(min(c.fit.cost for c in ran) - current.count, 0.0))
+    best = weighed[0]
+    if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
+        best = next(c for c in weighed if c.hypothesis is own.hypothesis)
+    elif best.hypothesis is not own.hypothesis:
+        current = polish(problem, best.fit)
+    now = {c.hypothesis.key: c.probability for c in weighed}
+    known = [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
+    known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
+    return current, replace(found, candidates=tuple(known))
 
 
 def pruned(problem: Problem, current: Fit) -> Fit:
@@ -587,8 +637,9 @@ def explore(
     preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
-    if not scores or scores[0].gain < least * excess:
-        return [], scores
+    answered = bool(scores) and scores[0].gain >= least * excess
+    # Where nothing answers a hinge may be missing. Of a strong discrepancy that is seen from the softened model.
+    allowed = ANSWERED if rough else 1.0 - MIN_SHARE if stage.chi2_per_dof <= STRONG else np.inf
 
     def started(score: Score) -> Fit | None:
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
@@ -601,8 +652,8 @@ def explore(
         fits = workers.map_in_time(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
         return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
 
-    found = begun(choose(scores))
-    if rough and not problem.motions_alone and left_by(found) > ANSWERED * excess and not workers.late:
+    found = begun(choose(scores)) if answered else []
+    if not problem.motions_alone and left_by(found) > allowed * excess and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
     if not (rough and left_by(found) < ANSWERED * excess):
@@ -827,8 +878,13 @@ def occam(candidate: Candidate, temper: float) -> float:
     H = candidate.fit.information
     x = np.array([q.to_internal(v) for q, v in zip(ps, effect.p, strict=True)])
     nulls = np.array([np.nan if q.null is None else q.to_internal(q.null) for q in ps])
-    std = np.sqrt(temper * np.diag(inverse(H, STEADY))[-len(ps) :])
-    absent = np.abs(x - nulls) < ABSENT * std
+    covariance = temper * inverse(H, STEADY)[-len(ps) :, -len(ps) :]
+    absent = np.abs(x - nulls) < ABSENT * np.sqrt(np.diag(covariance))
+    if np.any(absent):
+        # Those that the data only know together can each be at their nulls, and not all of them.
+        off = (x - nulls)[absent]
+        if off @ inverse(covariance[np.ix_(absent, absent)], STEADY) @ off > scipy.stats.chi2.isf(ABSENT_LEVEL, len(off)):
+            absent[:] = False
     keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
     count = int(np.sum(~absent))
     options = effect.hypothesis.options

@@ -15,6 +15,7 @@ LAWS = {
     "softening": (kernels.SOFTENING, 2.5e3, 1e-3, 4e3),
     "hysteresis": (kernels.HYSTERESIS, 1e3, 0.5, 4e3),
     "cable": (kernels.LINK, 300.0, 0.8, 0.01),
+    "cable that yields": (kernels.CABLE, 300.0, 0.8, 900.0),
 }
 MODES = kernels.modal_compliance(M, D, K, 0, PERIOD / POINTS)
 OMEGA = 2 * np.pi * np.arange(POINTS // 2 + 1) / PERIOD
@@ -49,6 +50,8 @@ def law_along(law, x, v):
     code, a, b, k = law
     if code == kernels.LINK:
         return a * x + b * np.tanh(v / k)
+    if code == kernels.CABLE:
+        return a * x + kernels.elastoplastic(x, k, b)
     if code == kernels.CUBIC:
         return a * x**3
     if code == kernels.SOFTENING:

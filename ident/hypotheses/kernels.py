@@ -11,7 +11,7 @@ from numba import njit
 
 TURNED = 19.1  # argument beyond which tanh is one in double precision
 VECTORS = {"contract", "reassoc", "nsz"}  # what lets the compiler step several records at once
-CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK = 0, 1, 2, 3, 4
+CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK, CABLE = 0, 1, 2, 3, 4, 5
 
 
 @njit(cache=True, nogil=True)
@@ -72,7 +72,9 @@ def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: float, h_old: float) -> float:
-    """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``."""
+    """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``; or of a ``CABLE``, see ``loop_sweep``, on a link."""
+    if code == 5:
+        return a * x + min(max(h_old - a * x_old + k * (x - x_old), -b), b)
     if code == 0:
         return a * x * x * x
     if code == 1:
@@ -111,6 +113,15 @@ def spring_point(
             return free - direct * b
         if h < -b:
             return free + direct * b
+        return x
+    if code == 5:
+        held = h_old - (a + k) * x_old
+        x = (free - direct * held) / (1.0 + direct * (a + k))
+        z = held + k * x
+        if z > b:
+            return (free - direct * b) / (1.0 + direct * a)
+        if z < -b:
+            return (free + direct * b) / (1.0 + direct * a)
         return x
     half, slope = (0.5 * a, -k) if code == 1 else (b, a - k)
     inner = max(1.0 + direct * slope, 1e-6)
@@ -204,7 +215,7 @@ def loop_sweep(
 
     Args:
         code, a, b, k: law. Of a gear, its two parameters and the linear stiffness, N m/rad; ``LINK``:
-            ``a x + b tanh(x' / k)`` on a link.
+            ``a x + b tanh(x' / k)`` on a link; ``CABLE``: ``a x`` and a spring ``k`` that yields at ``b`` there.
         linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
         modes: (4, modes) complex: poles, decay, gain_old, gain_new.
         start: (modes, S) complex state of the modes one step before the period.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.hypotheses.kernels import LINK, loop_sweep, spring_torque
+from ident.hypotheses.kernels import CABLE, LINK, loop_sweep, spring_torque
 from ident.mixing import MEMORY, mixed
 
 SWEEPS = 25  # periods at most until the steady state
@@ -36,6 +36,8 @@ def steady_loop(
     x = linear[-1] - start.real.sum(axis=0)
     if code == LINK:
         h = a * x + b * np.tanh((rate[-1] - (poles @ start).real) / k)
+    elif code == CABLE:
+        h = a * x
     else:
         h = np.array([spring_torque(code, a, b, k, v, v, 0.0) for v in x])
     memory, left = np.stack([x, x, h]), np.arange(S)

@@ -9,6 +9,8 @@ import numpy as np
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.inverse import Motion
 
+TRUE_STEPS = 4  # from a measured position to the one at which its error is that of the encoder
+
 
 def sensor_delay(joint: int, place: str) -> Hypothesis:
     """Measured position comes ``delay`` late: the true one is ``exp(s delay)`` times it."""
@@ -59,15 +61,18 @@ def sensor_lag(joint: int, place: str) -> Hypothesis:
 
 
 def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothesis:
-    """Measured position holds ``amplitude sin(turns q + phase)``; the true one is that much less.
+    """Measured position holds ``amplitude sin(turns q + phase)`` of the true one ``q``, which is that much less.
 
     Args:
         turns: of the encoder in a turn of the joint: the gear ratio where it sits at the motor.
     """
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        q = turns * motion.q(j)
-        return -motion.lines(p[0] * np.sin(q) + p[1] * np.cos(q))
+        measured, error = motion.q(j), 0.0
+        for _ in range(TRUE_STEPS):
+            q = turns * (measured - error)
+            error = p[0] * np.sin(q) + p[1] * np.cos(q)
+        return -motion.lines(error)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q = turns * motion.q(j)

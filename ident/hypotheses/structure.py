@@ -40,6 +40,7 @@ SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
 STIFFEST = 1e12  # N m/rad, of a hinge
 FARTHEST_REST = 10.0  # of a balancing spring, rad or m
 MOST_TILT = 3.0  # of an elastic axis towards each other axis, in units of that along the one from which it is sought
+YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
 
 
@@ -122,17 +123,25 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
     )
 
 
-def dress_pack(joint: int, place: str) -> Hypothesis:
-    """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``."""
+def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
+    """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``.
+
+    Args:
+        yields: whether the friction turns over with the path, as of cables that give before they slip (Dahl 1968), in
+            place of the velocity.
+    """
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        v = motion.v_link(j)
+        v, q = motion.v_link(j), motion.q_link(j)
         turn = 0.02 * float(np.sqrt(np.mean(v**2)))
+        give = YIELDS * float(np.std(q))
 
         def start(c):
-            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), turn]) if max(c[0], c[1]) > 0 else None
+            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), give if yields else turn]) if max(c[0], c[1]) > 0 else None
 
-        return Screen((motion.q_link(j), direction(v, turn)), start)
+        if not yields:
+            return Screen((q, direction(v, turn)), start)
+        return Screen((q, kernels.elastoplastic(q, 1.0 / max(give, 1e-12), 1.0)), start)
 
     return Hypothesis(
         "dress_pack",
@@ -142,7 +151,7 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
         (
             Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True, step=1e-3),
             Parameter("friction", "N m", 1e-9, 1e7, log=True, step=1e-3),
-            SMOOTHING,
+            Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02) if yields else SMOOTHING,
         ),
         None,
         lambda scale: [()],
@@ -150,7 +159,7 @@ def dress_pack(joint: int, place: str) -> Hypothesis:
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
         options={
-            "loop": lambda p: (kernels.LINK, p[0], p[1], p[2]),
+            "loop": lambda p: (kernels.CABLE, p[0], p[1], p[1] / p[2]) if yields else (kernels.LINK, p[0], p[1], p[2]),
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the motor.
             "trivial": lambda p: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
