@@ -49,6 +49,7 @@ FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
+NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 HOPEFUL = 5  # candidates fitted further after the first steps
 AS_GOOD = 0.8  # cost of a loop over that along the record, below which it is the loop that is right
@@ -203,6 +204,7 @@ def attribute(
         found = attribute_once(problem, current, hypotheses, workers)
         if not found.candidates:
             break
+        found = with_name(found)
         best, before = found.candidates[0], found.before
         fall = (before.cost - best.fit.cost) / found.scale
         if fall < MIN_EVIDENCE or found.explained < MIN_SHARE:
@@ -226,9 +228,27 @@ def attribute(
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
     current, rounds = rematched(problem, current, rounds, workers)
+    unknown = unknown or any(outdone(r) for r in rounds)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     return Attribution(baseline, detected, p_value, kept, current, unknown)
+
+
+def with_name(found: Round) -> Round:
+    """A round that a decoy has won which holds a law of the catalogue, won by that law.
+
+    Beside causes that are still missing what sets them apart means little: the decoy is a rival again at the end.
+    """
+    first = found.candidates[0].hypothesis
+    special = first.options.get("absorbs") if first.decoy else None
+    named = [c for c in found.candidates if c.hypothesis.key == (special, first.place)]
+    return replace(found, candidates=(*named, *(c for c in found.candidates if c not in named))) if named else found
+
+
+def outdone(found: Round) -> bool:
+    """Whether a decoy does better than the cause that a round has named."""
+    best = max(found.candidates, key=lambda c: c.probability)
+    return best.hypothesis.decoy and best is not found.candidates[0]
 
 
 def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> tuple[Fit, list[Round]]:
@@ -240,7 +260,7 @@ def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: 
     for found in rounds:
         winner = found.candidates[0].hypothesis
         there = {e.hypothesis.key for e in current.model.effects}
-        if len(there) > 1 and winner.key in there and not winner.decoy and not workers.late:
+        if (len(there) > 1 or outdone(found)) and winner.key in there and not winner.decoy and not workers.late:
             current, found = contest(problem, current, found, workers)
         out.append(found)
     return current, out
@@ -594,7 +614,7 @@ def under_noise_of_best(
     is compared as it is, in units of its own noise, with what others leave in units of theirs.
 
     Args:
-        ranked: candidates, best first; the first ``FINALISTS`` are fitted again.
+        ranked: candidates, best first; the first ``FINALISTS``, and those that come near the best, are fitted again.
     """
     if is_along_record(ranked[0][0]):
         return before, list(ranked)
@@ -604,8 +624,10 @@ def under_noise_of_best(
     def moved(pair: tuple[Hypothesis, Fit]) -> Fit | None:
         return None if is_along_record(pair[0]) else refit(problem, pair[1].model, weights, pair[1].remainders)
 
-    fits = workers.map(moved, ranked[:FINALISTS])
-    again = [*fits, *[None] * len(ranked[FINALISTS:])]
+    near = sum(r.cost - r.count <= NEAR * max(top.cost - top.count, 0.0) for _, r in ranked)
+    last = min(max(near, FINALISTS), HOPEFUL)
+    fits = workers.map(moved, ranked[:last])
+    again = [*fits, *[None] * len(ranked[last:])]
     weighed = [
         (h, r if is_along_record(h) else new or reweighted(problem, r, weights))
         for (h, r), new in zip(ranked, again, strict=True)

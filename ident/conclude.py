@@ -25,6 +25,7 @@ from ident.trust import (
     fails_held_out,
     known_probability,
     left_of,
+    shadowed,
     too_fast,
 )
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
@@ -79,7 +80,7 @@ def conclude(
         found = rounds[effect.hypothesis.key]
         trust = known_probability(left_of(effect.hypothesis, result), doubted)
         trust *= explained_share(found, final)
-        if pointless(effect) or too_fast(problem, last, effect):
+        if pointless(effect) or too_fast(problem, last, effect) or shadowed(found, result.rounds):
             trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
     direct = [_rounded(x, dataset.joints[x.joint]) for x in steps]

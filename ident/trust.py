@@ -20,7 +20,9 @@ CARRIED = 0.8  # the same where it explains the data that it was fitted to down 
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
 SHORT = 0.25  # by which the gap closed on held-out data may fall short of what the fitted ones promise
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
-LEAST_FOLLOWED = 0.1  # share of the path along which a ripple must lie in the compared band for its name to be trusted
+FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band for its name to be trusted
+SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
+SHADOW = 1e-3  # the same of any other cause at the joint: errors of a law of a few per cent
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 
@@ -73,19 +75,48 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
 
 
 def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect) -> bool:
-    """Whether a ripple lies beyond the compared band along nearly all the path of the motions.
+    """Whether motions show less than a few periods of a ripple in the compared band: many wave numbers fit those.
 
-    What is left of it there is a turn or two where the joint creeps: that has many wave numbers.
+    Elsewhere along the path the joint runs so fast that the ripple lies beyond the band.
     """
     names = [q.name for q in effect.hypothesis.parameters]
     if not problem.motions_alone or RIPPLE not in names:
         return False
-    slow = path = 0.0
+    wave_number, path = effect.value(RIPPLE), 0.0
     for group, pred in zip(problem.groups, predictions, strict=True):
-        speed = np.abs(pred.motion(group).v(effect.hypothesis.joint)) * group.window
-        slow += float(np.sum(speed[effect.value(RIPPLE) * speed < group.omega[group.n_compared - 1]]))
-        path += float(np.sum(speed))
-    return slow < LEAST_FOLLOWED * path
+        speed = np.abs(pred.motion(group).v(effect.hypothesis.joint)) * (group.window > 0.5)
+        slow = wave_number * speed < group.omega[group.n_compared - 1]
+        path += float(np.sum(speed[slow])) * group.period_time / speed.shape[1]
+    return wave_number * path < FEWEST_PERIODS * 2.0 * np.pi
+
+
+def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
+    """Whether a cause explains next to nothing beside another one at its joint: it may be what the other's law lacks.
+
+    A law is not that of nature: what it leaves looks like a second law of the same element, or of the same joint.
+    """
+
+    def fall(x: Round) -> float:
+        return float(x.before.costs[h.joint] - x.candidates[0].fit.costs[h.joint])
+
+    h = found.candidates[0].hypothesis
+    if h.joint < 0 or h.channel == "model":
+        return False
+    for other in rounds:
+        o = other.candidates[0].hypothesis
+        if other is found or o.joint != h.joint or o.channel == "model" or o.decoy:
+            continue
+        same = element(o) is not None and element(o) == element(h)
+        if fall(found) < (SHADOW_OF_LAW if same else SHADOW) * fall(other):
+            return True
+    return False
+
+
+def element(h: Hypothesis) -> str | None:
+    """What an effect is a law of, of which a joint has one: its gear or its friction."""
+    if h.channel == "spring" and not h.options.get("kinematic"):
+        return "gear"
+    return "friction" if "friction" in h.effect else None
 
 
 def collapsed(problem: Problem, final: Fit) -> bool:
