@@ -128,6 +128,8 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
     if v.gain is not None:
         g = v.gain
         closed = "" if g.gap_closed is None else f", {g.gap_closed:.1%} of the gap to the noise"
+        if g.gap_closed is not None and g.ci95 is not None:
+            closed += f" (95 %: {g.ci95[0]:.1%} to {g.ci95[1]:.1%})"
         unit = "N" if all(linear_joints(result.robot)) else "N m"
         lines += [f"Error on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} {unit}{closed}; noise {g.noise_floor:.2g}.", ""]
     if v.residual_description:

@@ -11,21 +11,26 @@ from ident.attribute import (
     POINTLESS_NATS,
     TEMPER,
     Candidate,
+    Round,
     astray,
     explained,
     occam,
+    outdone,
     pointless,
     polish,
     pruned,
     weigh,
+    with_name,
 )
 from ident.diagnose import diagnose, harmful, identify
 from ident.extended import Effect
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
+from ident.hypotheses.sensing import encoder_eccentricity
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
 from ident.torque_fit import PRIOR_LOG_STD, RIDGE, inverse, joint_costs, predictions, weighted_cost
+from ident.trust import shadowed
 from ident.verdict import Gain
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
@@ -71,6 +76,60 @@ def test_an_absent_parameter_costs_nothing_unless_it_makes_the_effect(named):
     without = -0.5 * np.log(1.0 + LOG_SPREAD**2 * 1e4 / TEMPER)
     assert absent == pytest.approx(without - POINTLESS_NATS - 0.5 * (near / 0.5) ** 2, abs=1e-3)
     assert present > absent - POINTLESS_NATS
+
+
+def test_parameters_that_are_known_together_alone_are_not_absent(named):
+    """Mass and centre of mass of a pendulum: each may be that of the model, their product not."""
+    h = named["link_inertia", "forearm_link"]
+    one = candidate(h, [0.9, -0.03, 0.0, 0.0, 1.0], [1.0] * 5)
+    product = np.array([1.0, 2.0, 0.0, 0.0, 0.0])
+    one.fit.information[3:, 3:] = np.diag([20.0, 80.0, 1.0, 1.0, 1.0]) + 1e8 * np.outer(product, product)
+    lone = candidate(h, [0.9, -0.03, 0.0, 0.0, 1.0], [20.0, 80.0, 1.0, 1.0, 1.0])
+    assert occam(one, TEMPER) < occam(lone, TEMPER) - 5.0
+
+
+def test_a_decoy_that_holds_a_law_steps_back_behind_it_and_is_told_of(named):
+    rub, decoy = named["coulomb_friction", "elbow_joint"], named["unknown:position_friction", "elbow_joint"]
+    elsewhere = named["coulomb_friction", "wrist_1_joint"]
+
+    def round_of(*members):
+        return Round(None, tuple(Candidate(h, None, 0.0, p) for h, p in members), (), 1.0, 1.0)
+
+    stepped = with_name(round_of((decoy, 0.8), (elsewhere, 0.15), (rub, 0.05)))
+    assert [c.hypothesis for c in stepped.candidates] == [rub, decoy, elsewhere] and outdone(stepped)
+    alone = round_of((decoy, 0.9), (elsewhere, 0.1))
+    assert with_name(alone) is alone and not outdone(alone)
+    clear = round_of((rub, 0.9), (decoy, 0.1))
+    assert with_name(clear) is clear and not outdone(clear)
+
+
+@pytest.mark.parametrize(
+    ("second", "left", "expected"),
+    [("hardening_stiffness", 30.0, True), ("hardening_stiffness", 80.0, False), ("cogging", 30.0, False), ("cogging", 0.5, True)],
+)
+def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shadow(named, second, left, expected):
+    def round_of(h, before, after, joint=2):
+        costs = [np.full(6, 10.0), np.full(6, 10.0)]
+        costs[0][joint], costs[1][joint] = before, after
+        first = Candidate(h, SimpleNamespace(costs=costs[1]), 0.0)
+        return Round(SimpleNamespace(costs=costs[0]), (first,), (), 1.0, 1.0)
+
+    soft = round_of(named["softening_stiffness", "elbow_joint"], 1100.0, 100.0)
+    other = round_of(named[second, "elbow_joint"], 100.0, 100.0 - left)
+    assert shadowed(other, (soft, other)) is expected
+    assert not shadowed(soft, (soft, other))
+    far = round_of(named[second, "wrist_1_joint"], 100.0, 100.0 - left, joint=3)
+    assert not shadowed(far, (soft, far))
+
+
+def test_an_encoder_that_is_off_its_centre_errs_by_the_true_angle(identified):
+    _, setup, result = identified
+    group = setup.problem.groups[0]
+    motion = predictions(setup.problem, result.model, result.remainders)[0].motion(group)
+    h, p = encoder_eccentricity(2, "elbow_joint"), np.array([0.03, 0.02])
+    error = -group.to_time(h.law(p, motion, 2, 1.0)[..., None])[..., 0]
+    true = motion.q(2) - error
+    assert error == pytest.approx(0.03 * np.sin(true) + 0.02 * np.cos(true), abs=1e-5)
 
 
 def test_a_law_and_its_limit_tie_where_the_data_cannot_tell_them_apart(named):

@@ -10,16 +10,17 @@ from hypothesis import strategies as st
 
 from ident.attribute import plainer
 from ident.dataset import Dataset, Segment
-from ident.diagnose import diagnose_fully, set_up, with_held_out
+from ident.diagnose import diagnose_fully, identify, set_up, with_held_out
 from ident.extended import Effect, Model, predict
 from ident.graybox import LinkChange, Parameters, build_structure
 from ident.hypotheses import catalogue
 from ident.hypotheses.sensing import torque_offset
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, fit_rigid, regressor
-from ident.torque_fit import fit
+from ident.screening import wave_numbers
+from ident.torque_fit import fit, predictions
 from ident.trust import too_fast
-from robot_assets.robot import Elasticity
+from robot_assets.robot import Elasticity, load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
 from tests.conftest import small_plan, through_files
@@ -214,3 +215,22 @@ def test_a_ripple_that_a_motion_runs_over_is_not_trusted(moved):
     assert fast and not slow
     rub = Effect(of["coulomb_friction", "wrist_3_joint"], np.array([1.0, 0.0, 1e-3]))
     assert not too_fast(problem, preds, rub)
+
+
+def test_a_ripple_is_sought_along_what_was_recorded_and_in_the_compared_band():
+    """628 periods a metre: a slow sweep shows them, fast moves do not, and the return that closes a motion is none of both."""
+    robot = load_robot("emps")
+    rng = np.random.default_rng(5)
+    t = np.arange(int(20 * RATE)) / RATE
+    segments = []
+    for i, period in enumerate((16.0, 3.0, 4.0)):
+        w, size = 2 * np.pi / period, 0.1
+        q, v, a = size * np.sin(w * t), size * w * np.cos(w * t), -size * w**2 * np.sin(w * t)
+        mass = robot.array("motor_inertia")[0] + 50.0
+        tau = mass * a + robot.array("viscous_friction")[0] * v + 8.0 * np.sin(628.0 * q + 0.7) + 0.5 * rng.normal(size=t.size)
+        segments.append(Segment(f"m{i}", "trajectory", "identification", t, tau[:, None], q[:, None] + 1e-6 * rng.normal(size=(t.size, 1))))
+    data = Dataset("sweep", "emps", robot, RATE, robot.joint_names, "zoh", np.array([1e-6]), np.array([0.5]), None, tuple(segments))
+    setup, result = identify(data)
+    preds = predictions(setup.problem, result.model, result.remainders)
+    found = wave_numbers(setup.problem, preds, 0)
+    assert min(abs(n - 628.0) for n in found) < 3.0, found
