@@ -492,7 +492,7 @@ def attribute_once(
     candidates are then also sought from a softened model. All are compared under the same weights.
     """
     before, softly = current, {}
-    found, scores = explore(problem, current, hypotheses, worth_a_refit(current), workers)
+    found, scores = explore(problem, current, hypotheses, worth_a_refit(problem, current), workers)
     excess = max(current.cost - current.count, 1.0)
     if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not workers.late:
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
@@ -535,13 +535,13 @@ def implausible(problem: Problem, result: Fit) -> bool:
     return bool(np.any(low | (known & (x[drives] > limit))))
 
 
-def worth_a_refit(current: Fit) -> float:
+def worth_a_refit(problem: Problem, current: Fit) -> float:
     """Share of the excess over noise that a linear step must explain for candidates to be refitted.
 
     Linear steps understate strong causes, and mean little about a baseline that a strong one has spoilt:
-    there only a clear answer counts.
+    there only a clear answer counts. Motions leave the drives near their guesses.
     """
-    if current.chi2_per_dof > HOPELESS:
+    if current.chi2_per_dof > HOPELESS and not problem.motions_alone:
         return CLEAR_ANSWER
     if current.chi2_per_dof > STRONG:
         return 0.0
