@@ -22,7 +22,8 @@ FREEZE = 0.1  # s: a channel that stands still for longer while the joint moves
 CLIPPED = 3e-3  # share of the samples at the very largest value, in runs of three or more
 SMOOTH = 1e-5  # torque noise over torque rms, below which a log was filtered
 LATEST = 0.03  # s: skews are looked for up to here
-ODD = 0.6  # samples: skews of less are common
+ODD = 1.0  # samples: skews of less are common
+HELD = 0.5  # samples by which a torque that is held over a sample is recorded early
 SETTLED = 0.3  # s: the filter of the band has forgotten the ends of the log
 BAND = 12.0  # Hz: band in which skew is estimated; rigid bodies and friction explain torque there
 BLOCKS = 8  # stretches of time, of which the jackknife leaves one out
@@ -302,16 +303,17 @@ def _band(s: Segment, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 
 
 def skew_warnings(s: Segment, dataset: Dataset) -> list[str]:
-    """Skews that are sure; of motions only, where rigid bodies rule. Half a sample is that of a held torque."""
+    """Skews that are sure; of motions only, where rigid bodies rule."""
     rate = dataset.sample_rate
+    held = HELD / rate if dataset.input_hold == "zoh" else 0.0
     if s.kind != "trajectory" or len(s.t) < 4 * rate * SETTLED + 100:
         return []
-    named = [("torque", "the positions", torque_skew(s, dataset))]
-    named += [(f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k) for j, k in enumerate(link_skew(s, dataset))]
+    named = [("torque", "the positions", torque_skew(s, dataset), -held)]
+    named += [(f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k, 0.0) for j, k in enumerate(link_skew(s, dataset))]
     return [
         f"{what} comes {abs(k.late) * 1e3:.2g} ms {'after' if k.late > 0 else 'before'} {other} (± {k.std * 1e3:.1g} ms): channels sampled at different times?"
-        for what, other, k in named
-        if k.sure and abs(k.late) > ODD / rate
+        for what, other, k, usual in named
+        if k.sure and abs(k.late - usual) > ODD / rate
     ]
 
 

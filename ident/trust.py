@@ -23,6 +23,7 @@ RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band for its name to be trusted
 SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
 SHADOW = 1e-3  # the same of any other cause at the joint: errors of a law of a few per cent
+HALF_TRUSTED = 0.1  # share of the discrepancy left, a third of its amplitude, at which a name is as likely wrong as right
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 
@@ -128,7 +129,7 @@ def collapsed(problem: Problem, final: Fit) -> bool:
 
 
 def known_probability(left: float, refuted: bool) -> float:
-    """How far the names can be trusted, from the share of the discrepancy that they leave."""
+    """How far the names can be trusted, from the share of the discrepancy, as power, that they leave."""
     if refuted:
         return 0.4
-    return float(1.0 / (1.0 + (left / 0.15) ** 2))
+    return float(1.0 / (1.0 + (left / HALF_TRUSTED) ** 2))

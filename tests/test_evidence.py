@@ -71,8 +71,8 @@ def test_an_absent_parameter_costs_nothing_unless_it_makes_the_effect(named):
     near = 0.5 * ABSENT * np.sqrt(TEMPER / information)
     none, some = (occam(candidate(coulomb, [3.0, a, 1e-3], [1e4, information, 1.0]), TEMPER) for a in (near, 0.5))
     assert none > some + 3.0
-    free = [information, 0.0, 1e4, 0.0, 0.0]
-    absent, present = (occam(candidate(drift, [c, 60.0, 3.0, 1e-3, 1e-3], free), TEMPER) for c in (near, 0.5))
+    free = [information, 0.0, 1e4, 0.0]
+    absent, present = (occam(candidate(drift, [c, 60.0, 3.0, 1e-3], free), TEMPER) for c in (near, 0.5))
     without = -0.5 * np.log(1.0 + LOG_SPREAD**2 * 1e4 / TEMPER)
     assert absent == pytest.approx(without - POINTLESS_NATS - 0.5 * (near / 0.5) ** 2, abs=1e-3)
     assert present > absent - POINTLESS_NATS

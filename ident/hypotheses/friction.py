@@ -198,27 +198,27 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
     def unit(
         motion: Motion, j: int, tau: float, smoothing: float, size: float | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return motion.v(j), sense(motion, j, smoothing, size), 1.0 - np.exp(-motion.time / tau)
+        return motion.par.viscous[j] * motion.v(j), sense(motion, j, smoothing, size), 1.0 - np.exp(-motion.time / tau)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        v, s, warm = unit(motion, j, p[1], p[4], p[2])
-        return p[2] * s * (1.0 + p[0] * warm) + p[3] * p[0] * warm * v
+        drag, s, warm = unit(motion, j, p[1], p[3], p[2])
+        return p[2] * s * (1.0 + p[0] * warm) + p[0] * warm * drag
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         smoothing = 2e-3 * np.sqrt(np.mean(motion.v(j) ** 2))
-        v, s, warm = unit(motion, j, shape[0], smoothing)
+        drag, s, warm = unit(motion, j, shape[0], smoothing)
 
         def start(c):
             coulomb = max(c[1], 1e-6)
-            change = c[2] / coulomb if c[1] > 1e-6 else 0.3 * np.sign(c[0])
+            change = c[2] / coulomb if c[1] > 1e-6 else c[0]
             change = float(np.clip(change, -0.9, 3.0)) or 0.1
-            return np.array([change, shape[0], coulomb, max(c[0] / change, 1e-6), smoothing])
+            return np.array([change, shape[0], coulomb, smoothing])
 
-        return Screen((warm * v, s, warm * s), start, shape)
+        return Screen((warm * drag, s, warm * s), start, shape)
 
     def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
         coulomb = max(old[0] + weights[1], 0.1 * old[0])
-        return np.array([np.clip(weights[2] / coulomb, -0.9, 3.0), p[1], coulomb, p[3], old[2]])
+        return np.array([np.clip(weights[2] / coulomb, -0.9, 3.0), p[1], coulomb, old[2]])
 
     return Hypothesis(
         "friction_drift",
@@ -229,7 +229,6 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
             Parameter("relative_change", "1", -0.98, 5.0, step=1e-3, center=0.0, spread=0.5, null=0.0),
             Parameter("time_constant", "s", 1.0, 1e5, log=True, step=1e-2),
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True),
-            Parameter("viscous", "N m s/rad", 1e-9, 1e7, log=True, nuisance=True),
             SMOOTHING,
         ),
         law,
