@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 from provenance import commit
 
-from ident.attribute import DETECTION_EXCESS, DETECTION_LEVEL, UNDETERMINED, discrepancy_p_value
+from ident.attribute import DETECTION_LEVEL
+from ident.baseline import DETECTION_EXCESS, UNDETERMINED, discrepancy_p_value
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import identify
 from ident.excitation import operating_points

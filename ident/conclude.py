@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident.attribute import UNDETERMINED, Attribution, Candidate, pointless
+from ident.attribute import Attribution
+from ident.baseline import UNDETERMINED
 from ident.dataset import Dataset
+from ident.evidence import Candidate, pointless
 from ident.extended import Effect, Prediction, is_along_record
 from ident.graybox import INERTIAL, parameter_unit
 from ident.hypotheses import Hypothesis

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.attribute import NOT_COMPUTED, Attribution, attribute, fit_baseline
+from ident.attribute import Attribution, attribute
+from ident.baseline import fit_baseline
 from ident.channel_checks import MOVES
 from ident.conclude import conclude, named_effects
 from ident.dataset import Dataset
@@ -33,6 +34,7 @@ from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, fit_rigid
+from ident.search import NOT_COMPUTED
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, Problem, data_count, fit, predictions
 from ident.trust import LEFT_ERROR, known_probability

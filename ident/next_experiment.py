@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.attribute import Attribution, Candidate
+from ident.attribute import Attribution
+from ident.evidence import Candidate
 from ident.excitation import Plan, make_plan
 from ident.extended import predict, simulated_laws
 from ident.graybox import Parameters, equilibrium, linearise

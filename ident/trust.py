@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident.attribute import DETECTION_EXCESS, Attribution, Round, implausible
+from ident.attribute import Attribution, Round
+from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
 from ident.hypotheses import Hypothesis
 from ident.torque_fit import Fit, Problem

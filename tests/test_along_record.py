@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.attribute import simulated
 from ident.diagnose import set_up
 from ident.extended import Effect, Model, along_record, is_along_record, joints_along_record, predict
 from ident.hypotheses import catalogue, kernels
+from ident.search import simulated
 from ident.torque_fit import fit, jacobian, joint_costs, make_weights, pack, predictions, unpack
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment

@@ -6,29 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import (
-    ABSENT,
-    POINTLESS_NATS,
-    TEMPER,
-    Candidate,
-    Round,
-    astray,
-    explained,
-    occam,
-    outdone,
-    pointless,
-    polish,
-    pruned,
-    weigh,
-    with_name,
-)
+from ident.attribute import Round, outdone, pruned, with_name
+from ident.baseline import astray
 from ident.diagnose import diagnose, harmful, identify
+from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
 from ident.extended import Effect
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
+from ident.search import polish
 from ident.torque_fit import PRIOR_LOG_STD, RIDGE, inverse, joint_costs, predictions, weighted_cost
 from ident.trust import shadowed
 from ident.verdict import Gain

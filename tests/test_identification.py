@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.attribute import discrepancy_p_value
+from ident.baseline import discrepancy_p_value
 from ident.diagnose import diagnose, identify, set_up
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.extended import Effect, Model, predict

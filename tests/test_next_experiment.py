@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import Candidate
+from ident.evidence import Candidate
 from ident.excitation import plan_from_toml, plan_to_toml
 from ident.extended import Effect, Model
 from ident.hypotheses import catalogue

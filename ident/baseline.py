@@ -1,0 +1,94 @@
+"""The baseline of a diagnosis: the gray-box without causes, fitted from several starts, and whether its drives can be those of the arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import scipy.stats
+
+from ident.extended import Effect, Model
+from ident.graybox import Parameters
+from ident.torque_fit import ANNEALING, Fit, Problem, anneal
+
+DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
+RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
+DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive among the parameters
+ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
+HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
+IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
+UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
+
+
+def fit_baseline(
+    problem: Problem, progress: Callable[[str], None] | None = None, effects: tuple[Effect, ...] = ()
+) -> Fit:
+    """Baseline parameters of the gray-box, with the ``effects`` that every candidate has too.
+
+    Where the fit leaves more than the noise it is started again: with less error added from the first, which leads into
+    other minima; with other dampers, which are determined far worse than springs, and do not come back once they have
+    collapsed; and gears that have gone astray, as one that is overdamped and hides its spring, from their guesses.
+    """
+    start = Model(problem.structure, problem.nominal, effects)
+    best = first = anneal(problem, start, progress=progress)
+
+    def again(par: Parameters) -> Fit:
+        """Fitted from other drives."""
+        return anneal(
+            problem,
+            replace(best.model, par=par),
+            ladder=ANNEALING[-2:],
+            iterations=8,
+            remainders=best.remainders,
+            progress=progress,
+        )
+
+    if best.chi2_per_dof > DETECTION_EXCESS:
+        other = anneal(problem, start, ladder=ANNEALING[1:], progress=progress)
+        best = min(best, other, key=lambda f: (np.sum(astray(problem, f)), f.cost))
+    if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
+        for factor in RESTART_DAMPING:
+            par = best.model.par
+            damping = np.maximum(par.damping, problem.nominal.damping) * factor
+            best = min(best, again(replace(par, damping=damping)), key=lambda f: f.cost)
+    lost = astray(problem, best)
+    if best.chi2_per_dof > DETECTION_EXCESS and np.any(lost):
+        par, guess = best.model.par, problem.nominal
+        drives = {name: np.where(lost, getattr(guess, name), getattr(par, name)) for name in DRIVE}
+        other = again(replace(par, **drives))
+        # Where they only go astray elsewhere they stand for what is missing.
+        if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
+            best = other
+    return replace(best, softer=first.softer)
+
+
+def astray(problem: Problem, result: Fit) -> np.ndarray:
+    """(n,) whether a gear has ended far from its starting guess."""
+    par, guess = result.model.par, problem.nominal
+    far = [np.abs(np.log(a / b)) for a, b in ((par.stiffness, guess.stiffness), (par.damping, guess.damping))]
+    return (far[0] > np.log(IMPLAUSIBLE)) | (far[1] > np.log(ASTRAY))
+
+
+def discrepancy_p_value(result: Fit) -> float:
+    """Probability of a cost this large by noise alone (chi-square, Wilson-Hilferty in the tail)."""
+    dof = max(result.count - len(result.names), 1)
+    return float(scipy.stats.chi2.sf(result.cost, dof))
+
+
+def implausible(problem: Problem, result: Fit) -> bool:
+    """Whether drives of a fit cannot be those of this arm: a stiffness or motor inertia far from its starting guess.
+
+    They then stand for what is missing.
+    """
+    n, x = problem.structure.n, result.model.par.to_log() - problem.nominal.to_log()
+    drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
+    known = np.sqrt(np.maximum(np.diag(result.covariance())[drives], 0.0)) < UNDETERMINED
+    limit = np.log(IMPLAUSIBLE)
+    # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
+    # its link: there the gears take up what else is wrong, and only a motor that is known tells.
+    low = x[drives] < -limit
+    if problem.motions_alone:
+        known[:n] = False
+        low &= known
+    return bool(np.any(low | (known & (x[drives] > limit))))

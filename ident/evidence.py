@@ -1,0 +1,141 @@
+"""How far data speak for one refitted hypothesis against others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.stats
+
+from ident.extended import Effect
+from ident.hypotheses import Hypothesis, Parameter
+from ident.torque_fit import Fit, inverse
+
+ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent
+ABSENT_LEVEL = 2.7e-3  # the same of several together, as a probability
+TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
+MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
+STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
+POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found absent
+DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
+RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A refitted hypothesis: the model with it, and its evidence against the others."""
+
+    hypothesis: Hypothesis
+    fit: Fit
+    log_evidence: float
+    probability: float = 0.0
+
+
+def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
+    """Share of the excess over noise that a cause explains: of all of it, or at the joint where it explains most.
+
+    Of several causes at different joints each explains a part of the whole and most of its own joint.
+
+    Args:
+        noise: of what is compared, in units of the weights: next to nothing where these bear with large errors.
+    """
+    falls = before.costs - after.costs
+    joint = int(np.argmax(falls))
+    floor = noise * before.count
+    whole = np.sum(falls) / max(before.cost - floor, 1.0)
+    return float(max(whole, falls[joint] / max(before.costs[joint] - floor / len(falls), 1.0)))
+
+
+def rivals_of_best(
+    before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
+) -> tuple[list[tuple[Hypothesis, Fit]], float]:
+    """Candidates that explain some of what the best one does, and the excess over noise that they leave there.
+
+    A real arm has causes at every joint: one that explains another joint is no alternative, and what is left
+    there is no error of this one. A change of the chain is seen at every joint.
+    """
+    ranked = sorted(ranked, key=lambda x: x[1].cost)
+    best, top = ranked[0]
+    falls = before.costs - top.costs
+    at = int(np.argmax(falls))
+    if best.channel == "model" or best.joint < 0 or falls[at] <= 0.0:
+        return ranked, max(top.cost - before.count, 0.0)
+    kept = [(h, r) for h, r in ranked if before.costs[at] - r.costs[at] >= RIVAL * falls[at]]
+    left = min(r.costs[at] for _, r in kept) - before.count / len(falls)
+    return kept, max(float(left), 0.0)
+
+
+def weigh(candidates: Sequence[Candidate], excess: float) -> list[Candidate]:
+    """Probabilities of refitted hypotheses, best first.
+
+    Under pure noise the evidence is half the difference of the costs. What the best model leaves
+    above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
+    difference counts only against ``TEMPER + MODEL_ERROR_SHARE x excess``. Parameters count by how far
+    the data narrow them down (``occam``).
+
+    Args:
+        excess: cost beyond noise that the best of them leaves.
+    """
+    cost = np.array([c.fit.cost for c in candidates])
+    decoy = np.array([c.hypothesis.decoy for c in candidates], float)
+    temper = TEMPER + MODEL_ERROR_SHARE / 6.0 * excess
+    evidence = -0.5 * (cost - cost.min()) / temper - DECOY_NATS * decoy
+    evidence += [occam(c, temper) + c.hypothesis.options.get("nats", 0.0) for c in candidates]
+    evidence -= evidence.max()
+    probability = np.exp(evidence) / np.exp(evidence).sum()
+    out = [
+        replace(c, log_evidence=float(e), probability=float(p))
+        for c, e, p in zip(candidates, evidence, probability, strict=True)
+    ]
+    return sorted(out, key=lambda c: -c.probability)
+
+
+def occam(candidate: Candidate, temper: float) -> float:
+    """Log of the share of what a hypothesis allowed beforehand that the data leave to it, at most 0.
+
+    ``-log det(1 + P L / temper) / 2`` with the spread ``P`` of its parameters before the data and their
+    information ``L`` with all other coordinates free (Laplace's approximation: MacKay, Neural Comput. 4,
+    1992), and the density of the values themselves where there is a prior. A parameter that the data do
+    not determine costs nothing, nor does one that they find absent, unless it is what makes the effect.
+    """
+    effect = candidate.fit.model.effects[-1]
+    ps = effect.hypothesis.parameters
+    H = candidate.fit.information
+    x = np.array([q.to_internal(v) for q, v in zip(ps, effect.p, strict=True)])
+    nulls = np.array([np.nan if q.null is None else q.to_internal(q.null) for q in ps])
+    covariance = temper * inverse(H, STEADY)[-len(ps) :, -len(ps) :]
+    absent = np.abs(x - nulls) < ABSENT * np.sqrt(np.diag(covariance))
+    if np.any(absent):
+        # Those that the data only know together can each be at their nulls, and not all of them.
+        off = (x - nulls)[absent]
+        if off @ inverse(covariance[np.ix_(absent, absent)], STEADY) @ off > scipy.stats.chi2.isf(ABSENT_LEVEL, len(off)):
+            absent[:] = False
+    keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
+    count = int(np.sum(~absent))
+    options = effect.hypothesis.options
+    essential = any(a and q.name == options.get("essential") for q, a in zip(ps, absent, strict=True))
+    nats = POINTLESS_NATS * (essential or pointless(effect))
+    if count == 0:
+        return -nats
+    own = np.linalg.inv(inverse(H[np.ix_(keep, keep)], STEADY)[-count:, -count:])
+    amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in ("sine", "cosine"))) if _wave(ps) else 0.0
+    spread = np.array(
+        [q.expected_spread(amplitude if q.name in ("sine", "cosine") else v) for q, v in zip(ps, effect.p, strict=True)]
+    )[~absent]
+    narrowed = np.linalg.slogdet(np.eye(count) + own * np.outer(spread, spread) / temper)[1]
+    stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
+    density = sum(((v - q.prior_center(stiffness)) / q.spread) ** 2 for q, v in zip(ps, x, strict=True))
+    return float(-0.5 * narrowed - 0.5 * density - nats)
+
+
+def pointless(effect: Effect) -> bool:
+    """Whether the parameters of an effect leave nothing of it that another one does not hold, or all lie at a bound."""
+    h = effect.hypothesis
+    sizes = [(q, v) for q, v in zip(h.parameters, effect.p, strict=True) if q.log and not q.nuisance]
+    at_bound = bool(sizes) and all(not q.lower * 1.01 < v < q.upper * 0.99 for q, v in sizes)
+    return at_bound or bool(h.options.get("trivial", lambda p: False)(effect.p))
+
+
+def _wave(parameters: Sequence[Parameter]) -> bool:
+    return {"sine", "cosine"} <= {q.name for q in parameters}

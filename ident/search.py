@@ -1,0 +1,396 @@
+"""Candidates for a cause: screened hypotheses refitted with the baseline, from where the missing cause lets them be found.
+
+A strong cause moves the drives to where no single step leads back. Candidates are therefore sought from the model as it
+stands, from one fitted under softened weights, and strong laws from the starting guesses of the drives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ident.baseline import DETECTION_EXCESS, HOPELESS, implausible
+from ident.evidence import explained, pointless
+from ident.extended import Effect, Model, Prediction, along_record, as_loop, is_along_record
+from ident.hypotheses import Hypothesis
+from ident.parallel import Workers
+from ident.screening import Score, screen, signal_scale
+from ident.torque_fit import ANNEALING, Fit, Problem, Weights, anneal, fit, joint_costs, make_weights, predictions
+
+CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain beyond that
+FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched by linear steps alone
+STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
+FINALISTS = 3  # candidates that are fitted to the end
+FIRST_STEPS = 4  # steps after which candidates are compared for the first time
+STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
+NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
+ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
+NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
+HOPEFUL = 5  # candidates fitted further after the first steps
+AS_GOOD = 0.8  # cost of a loop over that along the record, below which it is the loop that is right
+HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
+REFITS = 8  # candidates refitted in a round
+REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
+POLISH_STEPS = 40  # of the winner of a round
+PER_EFFECT = 2  # of one effect, at most
+NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
+MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place: share of the highest resonance tried, damping
+KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
+MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
+WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: linear steps understate strong effects
+WORTH_A_REFIT_FAINT = 0.1  # the same where what is left is faint
+
+
+def revived(problem: Problem, model: Model) -> Model:
+    """A model whose collapsed dampers and viscous friction are back at a size that a fit can move.
+
+    What a missing cause has driven towards nothing has no slope left in logarithmic coordinates.
+    """
+    par, least = model.par, problem.nominal
+    return replace(
+        model,
+        par=replace(
+            par,
+            damping=np.maximum(par.damping, REVIVED * least.damping),
+            viscous=np.maximum(par.viscous, REVIVED * least.viscous),
+            elastic_damping=np.maximum(par.elastic_damping, REVIVED * least.elastic_damping),
+        ),
+    )
+
+
+def polish(problem: Problem, result: Fit) -> Fit:
+    """The winner fitted to the end, under the noise that it sees itself."""
+    return fit(
+        problem,
+        revived(problem, result.model),
+        iterations=POLISH_STEPS,
+        remainders=result.remainders,
+    )
+
+
+def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
+    """The model fitted again under weights that bear with its error, and the relative error added.
+
+    A strong cause drives the baseline far from the truth, to where no step along a single
+    hypothesis leads back. With an error relative to the torque added to the noise the baseline
+    stays near, and hypotheses can be compared.
+    """
+    stages, ladder = current.softer, ANNEALING[:-1]
+    if not stages:
+        start = replace(current.model, par=problem.nominal)
+        last = anneal(problem, start, ladder=ladder)
+        stages = (*last.softer, last)
+    kept = 1
+    while kept < len(stages) and stages[kept].chi2_per_dof <= STRONG:
+        kept += 1
+    return stages[kept - 1], ladder[kept - 1]
+
+
+def worth_a_refit(problem: Problem, current: Fit) -> float:
+    """Share of the excess over noise that a linear step must explain for candidates to be refitted.
+
+    Linear steps understate strong causes, and mean little about a baseline that a strong one has spoilt:
+    there only a clear answer counts. Motions leave the drives near their guesses.
+    """
+    if current.chi2_per_dof > HOPELESS and not problem.motions_alone:
+        return CLEAR_ANSWER
+    if current.chi2_per_dof > STRONG:
+        return 0.0
+    return WORTH_A_REFIT if current.chi2_per_dof > FAINT else WORTH_A_REFIT_FAINT
+
+
+def explore_softly(
+    problem: Problem,
+    current: Fit,
+    direct: Sequence[tuple[Hypothesis, Fit]],
+    hypotheses: Sequence[Hypothesis],
+    workers: Workers,
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]], list[Score], dict[tuple[str, str], float]]:
+    """Candidates sought from a softened model, and those found ``direct``, under weights of the former.
+
+    Returns:
+        The model without a new cause under these weights, candidates and scores; and by ``key`` of a hypothesis
+        what it explains under softened weights: of two causes the sharp ones may see the other one alone.
+    """
+    stage, level = soften(problem, current)
+    found, scores = explore(problem, stage, hypotheses, 0.0, workers, rough=True)
+    # Of laws of which nothing is left but a special case, that one goes on.
+    last = [(h, r) for h, r in found if not pointless(r.model.effects[-1])][:FINALISTS]
+    softly = {h.key: explained(stage, r, noise=0.0) for h, r in last}
+    preds = predictions(problem, stage.model, stage.remainders)
+    sharp = make_weights(problem, preds, 0.0)
+    ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
+    ways = [(h, r, (*ladder, sharp)) for h, r in last]
+    ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
+
+    def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> Fit | None:
+        _, result, steps = way
+        last = None
+        for weights in steps:
+            last = refit(problem, result.model, weights, result.remainders)
+            result = last or result
+        return last
+
+    fits = workers.map_in_time(sharpened, ways, lambda way: f"finalist: {way[0].effect} at {way[0].place}")
+    finalists = [(h, r) for (h, _, _), r in zip(ways, fits, strict=True) if r is not None]
+    return reweighted(problem, current, sharp), finalists, scores, softly
+
+
+def under_noise_of_best(
+    problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]], workers: Workers
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
+    """Candidates, and the model without them, under the noise that the best of them sees.
+
+    Noise of the position reaches the torque through the laws of effects; weights without them would
+    take it for model error. A law along the record turns all noise into a residual of its own: what is left of that
+    is compared as it is, in units of its own noise, with what others leave in units of theirs.
+
+    Args:
+        ranked: candidates, best first; the first ``FINALISTS``, and those that come near the best, are fitted again.
+    """
+    if is_along_record(ranked[0][0]):
+        return before, list(ranked)
+    top = ranked[0][1]
+    weights = make_weights(problem, predictions(problem, top.model, top.remainders), 0.0)
+
+    def moved(pair: tuple[Hypothesis, Fit]) -> Fit | None:
+        return None if is_along_record(pair[0]) else refit(problem, pair[1].model, weights, pair[1].remainders)
+
+    near = sum(r.cost - r.count <= NEAR * max(top.cost - top.count, 0.0) for _, r in ranked)
+    last = min(max(near, FINALISTS), HOPEFUL)
+    fits = workers.map(moved, ranked[:last])
+    again = [*fits, *[None] * len(ranked[last:])]
+    weighed = [
+        (h, r if is_along_record(h) else new or reweighted(problem, r, weights))
+        for (h, r), new in zip(ranked, again, strict=True)
+    ]
+    return reweighted(problem, before, weights), sorted(weighed, key=lambda x: x[1].cost)
+
+
+def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
+    """A fit as it stands, its cost under other weights."""
+    preds = predictions(problem, result.model, result.remainders)
+    return replace(result, costs=joint_costs(problem, preds, weights), weights=weights)
+
+
+def explore(
+    problem: Problem,
+    stage: Fit,
+    hypotheses: Sequence[Hypothesis],
+    least: float,
+    workers: Workers,
+    *,
+    rough: bool = False,
+) -> tuple[list[tuple[Hypothesis, Fit]], list[Score]]:
+    """Candidates fitted under the weights of ``stage``, best first, and all scores.
+
+    Args:
+        least: share of the excess over noise that a linear step must explain for any to be refitted.
+        rough: the first steps are enough where they answer: the candidates are fitted again.
+    """
+    preds = predictions(problem, stage.model, stage.remainders)
+    scores = screen(problem, stage, preds, hypotheses)
+    excess = max(stage.cost - stage.count, 1.0)
+    answered = bool(scores) and scores[0].gain >= least * excess
+    # Where nothing answers a hinge may be missing. Of a strong discrepancy that is seen from the softened model.
+    allowed = ANSWERED if rough else 1.0 - MIN_SHARE if stage.chi2_per_dof <= STRONG else np.inf
+
+    def started(score: Score) -> Fit | None:
+        model = replace(stage.model, effects=extended_by(stage.model.effects, score))
+        return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
+
+    def finished(result: Fit) -> Fit:
+        return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
+
+    def begun(chosen: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
+        fits = workers.map_in_time(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
+        return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
+
+    found = begun(choose(scores)) if answered else []
+    if not problem.motions_alone and left_by(found) > allowed * excess and not workers.late:
+        found += begun(hinges_everywhere(problem, preds, scores))
+    found = hopeful(found)
+    if not (rough and left_by(found) < ANSWERED * excess):
+        last = workers.map(finished, [r for _, r in found])
+        found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
+    return sorted(found, key=lambda x: x[1].cost), scores
+
+
+def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
+    """Excess of the cost over noise that the best candidate leaves; infinite where there is none."""
+    return min((r.cost - r.count for _, r in found), default=np.inf)
+
+
+def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:
+    """Candidates that a few steps have not shown to be far behind the best.
+
+    The one that screening puts first is kept: where the drives have taken its place, as a stiffer gear takes that of
+    one that yields late, the first steps lead uphill.
+
+    Args:
+        found: in the order of their scores.
+    """
+    ranked = sorted(found, key=lambda x: x[1].cost)
+    limit = HOPELESS_RATIO * max(ranked[0][1].cost - ranked[0][1].count, 0.0) if ranked else 0.0
+    kept = [
+        (h, r) for i, (h, r) in enumerate(ranked[:HOPEFUL]) if i < FINALISTS or (r.cost - r.count < limit and not r.converged)
+    ]
+    first = [(h, r) for h, r in found[:1] if not r.converged and all(h is not k for k, _ in kept)]
+    return [*kept, *first]
+
+
+def refit(
+    problem: Problem, model: Model, weights: Weights, remainders: Sequence[np.ndarray], iterations: int = 10
+) -> Fit | None:
+    """A candidate fitted from where screening put it.
+
+    None where its model cannot be computed, or ends where the data feel no change of its last effect.
+    """
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+            result = fit(
+                problem,
+                revived(problem, model),
+                iterations=iterations,
+                weights=weights,
+                remainders=remainders,
+            )
+    except NOT_COMPUTED:
+        return None
+    felt = np.diag(result.information)[-len(result.model.effects[-1].p) :]
+    return result if np.any(felt > 0.0) else None
+
+
+def choose(scores: Sequence[Score]) -> list[Score]:
+    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
+
+    A linear step hardly tells where a hinge is: if one is worth a refit, so are those before and after other joints
+    that come near it.
+    """
+    out: list[Score] = []
+    top = scores[0].gain if scores else 0.0
+    for score in scores:
+        same = sum(s.hypothesis.effect == score.hypothesis.effect for s in out)
+        if score.start is None or same >= PER_EFFECT or score.gain < KEEP_RATIO * top:
+            continue
+        out.append(score)
+        if len(out) == REFITS:
+            break
+    hinges = [s for s in out if "hinge" in s.hypothesis.options]
+    taken = {_side(s) for s in hinges}
+    for s in scores:
+        if hinges and "hinge" in s.hypothesis.options and s.start is not None and s.gain >= NEAR_HINGE * hinges[0].gain:
+            if _side(s) not in taken:
+                taken.add(_side(s))
+                out.append(s)
+    return out
+
+
+def _side(score: Score) -> tuple[tuple[str, str], bool]:
+    """Where a hinge is."""
+    return score.hypothesis.key, score.hypothesis.options["before"]
+
+
+def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Sequence[Score]) -> list[Score]:
+    """A hinge at each place where there may be one, of a resonance within the band.
+
+    The gears have taken up the best part of one that is missing: a linear step from there has a wrong sign, or
+    answers at another joint.
+    """
+    middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).resonances[-1]
+    hinges = [s for s in scores if "hinge" in s.hypothesis.options]
+    return [replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO)) for s in hinges]
+
+
+def beside_strong(
+    problem: Problem,
+    before: Fit,
+    ranked: Sequence[tuple[Hypothesis, Fit]],
+    scores: Sequence[Score],
+    workers: Workers,
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
+    """Candidates, and the model without them, beside strong effects where one of those does better.
+
+    A strong effect that is missing moves the drives to where none of its steps leads back, and with
+    them the noise that the model passes on: a joint that sticks looks like one without motor inertia.
+    Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
+    gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
+    as loops where these do as well.
+    """
+
+    def annealed(score: Score) -> Fit | None:
+        start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+                return anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
+        except NOT_COMPUTED:
+            return None
+
+    likely = min(ranked, key=lambda x: x[1].cost)[0].joint if ranked else -1
+    chosen = strong_effects(problem, before, scores, likely)
+    chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
+    fits = workers.map_in_time(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+    pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
+    strong = [(h, r) for h, r in pairs if not is_along_record(h)]
+    along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
+    strong += workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
+    if not left_by(strong) < left_by(ranked):
+        return before, list(ranked)
+    best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
+    for h, r in sorted(strong, key=lambda x: x[1].cost):
+        best.setdefault(h.key, (h, r))
+    others = [(h, r) for h, r in ranked if h.key not in best]
+    return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+
+
+def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely: int) -> list[Score]:
+    """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
+
+    A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
+    of the time hardly shows its inertia: the linear step of a score says little about either. Motions below the
+    resonances hardly show the gears.
+    """
+    preds = predictions(problem, stage.model, stage.remainders)
+    loudest = int(np.argmax(stage.costs))
+    scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} if j >= 0}
+    return [
+        replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))
+        for s in scores
+        if s.hypothesis.joint in scales
+        and "size" in s.hypothesis.options
+        and not (problem.motions_alone and s.hypothesis.channel == "spring")
+    ]
+
+
+def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:
+    """A law of the gear that was fitted along the record, as the loop that it is where that reaches the noise, or nearly.
+
+    It does not where the arm rattles, and has several steady motions.
+    """
+    loop = as_loop(h)
+    *others, last = result.model.effects
+    model = replace(result.model, effects=(*others, replace(last, hypothesis=loop)))
+    other = refit(problem, model, result.weights, result.remainders, FIRST_STEPS)
+    # At the joint itself: another cause may be elsewhere.
+    noise, j = result.count / problem.structure.n, h.joint
+    if other is not None and other.costs[j] < max(DETECTION_EXCESS * noise, AS_GOOD * result.costs[j]):
+        return loop, other
+    return h, result
+
+
+def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:
+    """Effects with the hypothesis of a score, which takes the place of a special case of its own."""
+    h = score.hypothesis
+    special = [e for e in effects if e.hypothesis.key == (h.options.get("absorbs"), h.place)]
+    start = score.start
+    if special:
+        start = h.options["absorb"](start, score.weights, special[0].p)
+    kept = tuple(e for e in effects if not special or e.hypothesis.key != special[0].hypothesis.key)
+    return (*kept, Effect(h, clip_to_bounds(h, start)))
+
+
+def clip_to_bounds(h: Hypothesis, start: np.ndarray) -> np.ndarray:
+    """The start of a refit within the bounds of the parameters."""
+    return np.array([np.clip(v, q.lower, q.upper) for v, q in zip(start, h.parameters, strict=True)])
