@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, discrepancy_p_value, implausible
+from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, implausible
 from ident.evidence import ABSENT, Candidate, explained, pointless, rivals_of_best, weigh
 from ident.extended import Effect, is_along_record
 from ident.hypotheses import Hypothesis, catalogue
@@ -106,14 +106,13 @@ def attribute(
     current, rounds, unknown, count = baseline, [], False, 0
     while detected and count < max_causes and not settled(current) and not workers.late:
         workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
-        found = attribute_once(problem, current, hypotheses, workers)
-        if not found.candidates:
+        found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current))
+        if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
+            found = attribute_once(problem, current, hypotheses, workers, 0.0)
+        if not answers(found):
             break
         found = with_name(found)
-        best, before = found.candidates[0], found.before
-        fall = (before.cost - best.fit.cost) / found.scale
-        if fall < MIN_EVIDENCE or found.explained < MIN_SHARE:
-            break
+        best = found.candidates[0]
         rounds.append(found)
         count += 1
         unknown = unknown or best.hypothesis.decoy
@@ -137,6 +136,14 @@ def attribute(
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     return Attribution(baseline, detected, p_value, kept, current, unknown)
+
+
+def answers(found: Round) -> bool:
+    """Whether the best candidate of a round explains enough to be a cause."""
+    if not found.candidates:
+        return False
+    fall = (found.before.cost - found.candidates[0].fit.cost) / found.scale
+    return fall >= MIN_EVIDENCE and found.explained >= MIN_SHARE
 
 
 def with_name(found: Round) -> Round:
@@ -329,15 +336,19 @@ def attribute_once(
     problem: Problem,
     current: Fit,
     hypotheses: Sequence[Hypothesis],
-    workers: Workers = Workers(),
+    workers: Workers,
+    least: float,
 ) -> Round:
     """One round: screen all, refit the best, weigh them.
 
     A strong cause may have spoilt the model from which others are sought, so that none of them answers;
     candidates are then also sought from a softened model. All are compared under the same weights.
+
+    Args:
+        least: share of the excess over noise that a linear step must explain for any to be refitted from the model as it is.
     """
     before, softly = current, {}
-    found, scores = explore(problem, current, hypotheses, worth_a_refit(problem, current), workers)
+    found, scores = explore(problem, current, hypotheses, least, workers)
     excess = max(current.cost - current.count, 1.0)
     if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not workers.late:
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)

@@ -19,7 +19,7 @@ from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import ANNEALING, Fit, Problem, Weights, anneal, fit, joint_costs, make_weights, predictions
 
-CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain beyond that
+CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain where the baseline is hopeless
 FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched by linear steps alone
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 FINALISTS = 3  # candidates that are fitted to the end
@@ -88,13 +88,13 @@ def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
     return stages[kept - 1], ladder[kept - 1]
 
 
-def worth_a_refit(problem: Problem, current: Fit) -> float:
+def worth_a_refit(current: Fit) -> float:
     """Share of the excess over noise that a linear step must explain for candidates to be refitted.
 
     Linear steps understate strong causes, and mean little about a baseline that a strong one has spoilt:
-    there only a clear answer counts. Motions leave the drives near their guesses.
+    there only a clear answer counts.
     """
-    if current.chi2_per_dof > HOPELESS and not problem.motions_alone:
+    if current.chi2_per_dof > HOPELESS:
         return CLEAR_ANSWER
     if current.chi2_per_dof > STRONG:
         return 0.0
