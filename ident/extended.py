@@ -233,7 +233,7 @@ def predict_at(
 def _added_stiffness(solution: Solution, effects: Sequence[Effect]) -> np.ndarray:
     """(n,) regression of the torques of gear effects on the deflection, lines above zero, N m/rad."""
     out = np.zeros(solution.delta.shape[-1])
-    for j in {e.hypothesis.joint for e in effects if not e.hypothesis.options.get("kinematic")}:
+    for j in {e.hypothesis.joint for e in effects if e.hypothesis.gear_law}:
         delta, torque = solution.delta[:, 1:, j], solution.torques.spring[:, 1:, j]
         out[j] = np.sum(torque * delta.conj()).real / max(np.sum(np.abs(delta) ** 2), 1e-300)
     return out
@@ -406,8 +406,7 @@ def _along_record(
 
 def _closes_itself(effect: Effect) -> bool:
     """Whether an effect's loop is solved in one pass."""
-    h = effect.hypothesis
-    return not h.options.get("kinematic") and (h.channel == "spring" or "loop" in h.options)
+    return effect.hypothesis.gear_law or "loop" in effect.hypothesis.options
 
 
 def _modes(

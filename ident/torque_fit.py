@@ -279,11 +279,7 @@ def _beside_gears(
     the motor takes of that.
     """
     n = model.structure.n
-    loops = [
-        e.hypothesis
-        for e in model.effects
-        if e.hypothesis.channel == "spring" and not e.hypothesis.options.get("kinematic")
-    ]
+    loops = [e.hypothesis for e in model.effects if e.hypothesis.gear_law]
     moved = []
     along = joints_along_record(model, group)
     for c in sorted({f * n + h.joint for h in loops for f in range(4 if h.joint in along else 2)}):

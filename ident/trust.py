@@ -116,7 +116,7 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
 
 def element(h: Hypothesis) -> str | None:
     """What an effect is a law of, of which a joint has one: its gear or its friction."""
-    if h.channel == "spring" and not h.options.get("kinematic"):
+    if h.gear_law:
         return "gear"
     return "friction" if "friction" in h.effect else None
 

@@ -137,6 +137,11 @@ class Hypothesis:
     def key(self) -> tuple[str, str]:
         return self.effect, self.place
 
+    @property
+    def gear_law(self) -> bool:
+        """Whether it is a law of the gear's torque on its deflection, as an error of its transmission is not."""
+        return self.channel == "spring" and not self.options.get("kinematic")
+
 
 @dataclass(frozen=True)
 class SignalScale:
