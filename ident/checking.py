@@ -169,7 +169,7 @@ def _warnings(dataset: Dataset) -> list[str]:
 
 def _brief_warnings(dataset: Dataset) -> list[str]:
     """Motions too short in all to tell causes apart."""
-    fitted = [s for s in dataset.segments if s.role == "identification"]
+    fitted = dataset.select(role="identification")
     if not fitted or any(s.kind != "trajectory" for s in fitted):
         return []
     seconds = sum(s.n_samples for s in fitted) / dataset.sample_rate
