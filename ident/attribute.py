@@ -36,6 +36,7 @@ from ident.search import (
     refit,
     reweighted,
     under_noise_of_best,
+    worth_a_hinge,
     worth_a_refit,
 )
 from ident.torque_fit import Fit, Problem, predictions
@@ -106,9 +107,11 @@ def attribute(
     current, rounds, unknown, count = baseline, [], False, 0
     while detected and count < max_causes and not settled(current) and not workers.late:
         workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
-        found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current))
+        # What is left beside a cause is mostly what its law lacks, and no hinge.
+        bare = np.inf if rounds else worth_a_hinge(current)
+        found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current), bare)
         if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
-            found = attribute_once(problem, current, hypotheses, workers, 0.0)
+            found = attribute_once(problem, current, hypotheses, workers, 0.0, bare)
         if not answers(found):
             break
         found = with_name(found)
@@ -132,10 +135,9 @@ def attribute(
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
     current, rounds = rematched(problem, current, rounds, workers)
-    unknown = unknown or any(outdone(r) for r in rounds)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
-    return Attribution(baseline, detected, p_value, kept, current, unknown)
+    return Attribution(baseline, detected, p_value, kept, current, unknown or any(outdone(r) for r in kept))
 
 
 def answers(found: Round) -> bool:
@@ -338,6 +340,7 @@ def attribute_once(
     hypotheses: Sequence[Hypothesis],
     workers: Workers,
     least: float,
+    bare: float,
 ) -> Round:
     """One round: screen all, refit the best, weigh them.
 
@@ -345,10 +348,10 @@ def attribute_once(
     candidates are then also sought from a softened model. All are compared under the same weights.
 
     Args:
-        least: share of the excess over noise that a linear step must explain for any to be refitted from the model as it is.
+        least, bare: as of ``search.explore``, from the model as it is.
     """
     before, softly = current, {}
-    found, scores = explore(problem, current, hypotheses, least, workers)
+    found, scores = explore(problem, current, hypotheses, least, bare, workers)
     excess = max(current.cost - current.count, 1.0)
     if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not workers.late:
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)

@@ -101,6 +101,14 @@ def worth_a_refit(current: Fit) -> float:
     return WORTH_A_REFIT if current.chi2_per_dof > FAINT else WORTH_A_REFIT_FAINT
 
 
+def worth_a_hinge(current: Fit) -> float:
+    """Share of the excess over noise that the best candidate may leave before hinges are tried everywhere.
+
+    Where nothing answers one may be missing. Of a strong discrepancy that is seen from the softened model.
+    """
+    return 1.0 - MIN_SHARE if current.chi2_per_dof <= STRONG else np.inf
+
+
 def explore_softly(
     problem: Problem,
     current: Fit,
@@ -115,7 +123,7 @@ def explore_softly(
         what it explains under softened weights: of two causes the sharp ones may see the other one alone.
     """
     stage, level = soften(problem, current)
-    found, scores = explore(problem, stage, hypotheses, 0.0, workers, rough=True)
+    found, scores = explore(problem, stage, hypotheses, 0.0, ANSWERED, workers, rough=True)
     # Of laws of which nothing is left but a special case, that one goes on.
     last = [(h, r) for h, r in found if not pointless(r.model.effects[-1])][:FINALISTS]
     softly = {h.key: explained(stage, r, noise=0.0) for h, r in last}
@@ -180,6 +188,7 @@ def explore(
     stage: Fit,
     hypotheses: Sequence[Hypothesis],
     least: float,
+    bare: float,
     workers: Workers,
     *,
     rough: bool = False,
@@ -188,14 +197,13 @@ def explore(
 
     Args:
         least: share of the excess over noise that a linear step must explain for any to be refitted.
+        bare: share of it that the best may leave after the first steps, beyond which hinges are tried everywhere.
         rough: the first steps are enough where they answer: the candidates are fitted again.
     """
     preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
     answered = bool(scores) and scores[0].gain >= least * excess
-    # Where nothing answers a hinge may be missing. Of a strong discrepancy that is seen from the softened model.
-    allowed = ANSWERED if rough else 1.0 - MIN_SHARE if stage.chi2_per_dof <= STRONG else np.inf
 
     def started(score: Score) -> Fit | None:
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
@@ -209,7 +217,7 @@ def explore(
         return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
 
     found = begun(choose(scores)) if answered else []
-    if not problem.motions_alone and left_by(found) > allowed * excess and not workers.late:
+    if not problem.motions_alone and left_by(found) > bare * excess and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
     if not (rough and left_by(found) < ANSWERED * excess):
