@@ -83,6 +83,41 @@ def test_friction_of_every_joint_counts_once(ur10, tmp_path):
     assert verdict.gain.gap_closed > 0.9
 
 
+def test_a_cable_that_gives_before_it_slips_is_named_with_its_friction(ur10, tmp_path):
+    """The plant of the other tests has cables whose friction turns over with the velocity; here it does with the path."""
+    from collections.abc import Callable
+    from dataclasses import dataclass
+
+    from sim.effects.effect import Run, State, Torque
+
+    @dataclass(frozen=True)
+    class YieldingCable:
+        place: str
+        stiffness: float
+        friction: float
+        give: float
+
+        def edit(self, spec, robot, drives):
+            spec.joint(f"link:{self.place}").stiffness = [self.stiffness, 0, 0]
+
+        def torque(self, run: Run) -> Callable[[State], Torque]:
+            j, z = run.joint(self.place), np.zeros(run.simulations)
+
+            def step(x: State) -> Torque:
+                z[:] = np.clip(z + x.v_link[:, j] * run.step / self.give, -1.0, 1.0)
+                return Torque(j, 0.0, -self.friction * z)
+
+            return step
+
+    drives = draw_drives(np.random.default_rng(8), ur10)
+    cable = YieldingCable("wrist_1_joint", 20.0, 1.0, 2e-3)
+    data = run_experiment(small_plan(ur10, 8), [cable], seed=8, drives=drives)
+    (cause,) = diagnose(through_files(data, tmp_path)).causes
+    assert (cause.effect, cause.joint) == ("dress_pack", "wrist_1_joint") and cause.probability > 0.9
+    assert cause.parameters["stiffness"].value == pytest.approx(20.0, rel=0.02)
+    assert cause.parameters["friction"].value == pytest.approx(1.0, rel=0.05)
+
+
 def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
     """The catalogue lacks it, but a model with it is measured and written."""
     from dataclasses import dataclass
