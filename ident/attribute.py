@@ -46,6 +46,7 @@ DOUBTED_LEVEL = 1e-2  # the same where the drives that fit cannot be those of th
 RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the record leaves no more than noise
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
+LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
@@ -79,8 +80,13 @@ class Attribution:
     @property
     def left_share(self) -> float:
         """Share of the discrepancy (excess over noise) that no cause explains."""
-        before = max(self.baseline.chi2_per_dof - 1.0, 1e-12)
-        return float(np.clip((self.final.chi2_per_dof - DETECTION_EXCESS) / before, 0.0, 1.0))
+        return left_share(self.baseline, self.final)
+
+
+def left_share(baseline: Fit, current: Fit) -> float:
+    """Share of the discrepancy of the baseline that a model leaves, 0 to 1."""
+    before = max(baseline.chi2_per_dof - 1.0, 1e-12)
+    return float(np.clip((current.chi2_per_dof - DETECTION_EXCESS) / before, 0.0, 1.0))
 
 
 def attribute(
@@ -118,7 +124,7 @@ def attribute(
         best = found.candidates[0]
         rounds.append(found)
         count += 1
-        unknown = unknown or best.hypothesis.decoy
+        unknown = unknown or (best.hypothesis.decoy and left_share(baseline, current) > LEFT_TO_DECOYS)
         if best.hypothesis.decoy and not best.hypothesis.options.get("baseline"):
             break
         current = polish(problem, best.fit)
@@ -232,8 +238,8 @@ def pruned(problem: Problem, current: Fit) -> Fit:
     if len(needed) == len(effects):
         return current
     other = polish(problem, replace(current, model=replace(current.model, effects=needed)))
-    scale = max(1.0, current.cost / current.count)
-    return other if other.cost - current.cost < MIN_EVIDENCE * scale else current
+    same = reweighted(problem, current, other.weights)
+    return other if other.cost - same.cost < MIN_EVIDENCE * max(1.0, same.cost / same.count) else current
 
 
 def settled(current: Fit) -> bool:
@@ -258,7 +264,7 @@ def companions(
     if len(same) < 2:
         return current, []
     preds = predictions(problem, current.model, current.remainders)
-    noise = current.count / problem.structure.n
+    noise = current.counts
     left = np.maximum(current.costs - noise, 1.0)
     scores = [
         s

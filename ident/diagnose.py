@@ -26,7 +26,7 @@ from ident.graybox import (
 )
 from ident.hypotheses.sensing import torque_offset
 from ident.inverse import Sampling
-from ident.link_sensor import find_link_delays
+from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.next_experiment import separating_experiment
 from ident.noise import sample_noise
 from ident.parallel import Workers, one_thread_each
@@ -45,6 +45,7 @@ MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
 MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
+LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
 SETTLED_BY_INERTIAS = 0.5  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
 HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
 LEAST_HELD_OUT = 2.0  # s of it
@@ -61,8 +62,11 @@ class Setup:
     steps: tuple[Steps, ...] = ()
 
 
-def set_up(dataset: Dataset) -> Setup:
+def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     """Records, structure and starting guesses of a dataset.
+
+    Args:
+        fast: as of ``build_groups``.
 
     Raises:
         DataError: where nothing is left for identification, no joint moves, or there is less to compare than to fit.
@@ -70,11 +74,11 @@ def set_up(dataset: Dataset) -> Setup:
     robot = dataset.robot
     nominal, structure = Parameters.nominal(robot), build_structure(robot)
     band = motion_band_hz(dataset, structure, nominal)
-    groups = build_groups(dataset, motion_band_hz=band)
+    groups = build_groups(dataset, motion_band_hz=band, fast=fast)
     multisines = tuple(g for g in groups if g.window is None)
     held_out = ()
     if any(s.role == "validation" for s in dataset.segments):
-        held_out = build_groups(dataset, role="validation", motion_band_hz=band)
+        held_out = build_groups(dataset, role="validation", motion_band_hz=band, fast=fast)
     q_std, tau_std = _noise(dataset)
     declared = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
     steps = find_steps(dataset, declared) if np.all(declared > 0) else ()
@@ -216,9 +220,14 @@ def diagnose_fully(
         say("the recording looks mislabelled: no causes are sought")
         max_causes = 0
     setup, baseline = identify(dataset, progress=say)
-    result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
+    recorded = setup.problem.groups
+    linked = None if doubts else by_link_encoders(dataset, setup, baseline, max_causes, workers)
+    if linked is not None:
+        setup, recorded, baseline, result = linked
+    else:
+        result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     nominal, rigid = setup.problem.nominal, None
-    if unresolved(result) and not doubts and not workers.late and setup.problem.motions_alone:
+    if linked is None and unresolved(result) and not doubts and not workers.late and setup.problem.motions_alone:
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
     problem, cut = setup.problem, workers.late
     say("gain on held-out data")
@@ -241,7 +250,7 @@ def diagnose_fully(
         gain, shown, pairs = tested(result)
     say("evidence")
     last = predictions(problem, result.final.model, result.final.remainders)
-    late = find_link_delays(problem, last)
+    late = find_link_delays(recorded, last, problem.sampling.sample_time)
     separating = separating_experiment(problem, result)
     verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
     if cut:
@@ -323,6 +332,37 @@ def unresolved(result: Attribution) -> bool:
     """Whether much of the discrepancy is left without a cause."""
     final = result.final
     return result.detected and (final.chi2_per_dof > LEFT_ERROR or result.unknown)
+
+
+def by_link_encoders(
+    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
+) -> tuple[Setup, tuple[Group, ...], Fit, Attribution] | None:
+    """Causes sought in torque and link encoders together, where those then explain what both show; else None.
+
+    Link encoders of a real arm have errors of their own, and with links that are not those of the model what they show
+    of the gears belies its torque: the torque alone then says more.
+
+    Returns:
+        The setup that was fitted, its groups as recorded, baseline and causes.
+    """
+    if not comparable_links(setup.problem):
+        return None
+    workers.say("link encoders")
+    late = find_link_delays(
+        setup.problem.groups,
+        predictions(setup.problem, baseline.model, baseline.remainders),
+        setup.problem.sampling.sample_time,
+    )
+    wide = set_up(dataset, fast=True)
+    recorded = wide.problem.groups
+    wide = replace(wide, problem=with_link_encoders(wide.problem, late))
+    try:
+        both = fit_baseline(wide.problem, workers.say)
+        found = attribute(wide.problem, both, max_causes=max_causes, workers=workers.for_half())
+    except NOT_COMPUTED:
+        return None
+    explained = found.detected and not found.unknown and found.left_share <= LEFT_BY_BOTH
+    return (wide, recorded, both, found) if explained else None
 
 
 def with_inertias(

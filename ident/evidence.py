@@ -42,9 +42,9 @@ def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
     """
     falls = before.costs - after.costs
     joint = int(np.argmax(falls))
-    floor = noise * before.count
-    whole = np.sum(falls) / max(before.cost - floor, 1.0)
-    return float(max(whole, falls[joint] / max(before.costs[joint] - floor / len(falls), 1.0)))
+    floors = noise * before.counts
+    whole = np.sum(falls) / max(before.cost - np.sum(floors), 1.0)
+    return float(max(whole, falls[joint] / max(before.costs[joint] - floors[joint], 1.0)))
 
 
 def rivals_of_best(
@@ -62,7 +62,7 @@ def rivals_of_best(
     if best.channel == "model" or best.joint < 0 or falls[at] <= 0.0:
         return ranked, max(top.cost - before.count, 0.0)
     kept = [(h, r) for h, r in ranked if before.costs[at] - r.costs[at] >= RIVAL * falls[at]]
-    left = min(r.costs[at] for _, r in kept) - before.count / len(falls)
+    left = min(r.costs[at] for _, r in kept) - before.counts[at]
     return kept, max(float(left), 0.0)
 
 

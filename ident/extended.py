@@ -84,6 +84,12 @@ class Prediction:
     def motion(self, group: Group) -> Motion:
         return Motion(group, self.solution, self.par)
 
+    def outputs(self, group: Group) -> np.ndarray:
+        """(S, L, n + M) predicted recorded torque, N m, and link positions, rad, as ``Group.outputs``."""
+        if not group.links:
+            return self.U
+        return np.concatenate([self.U, self.solution.Q_a[..., self.structure.driven[list(group.links)]]], axis=-1)
+
     @cached_property
     def sampled_impedance(self) -> np.ndarray:
         """(L, n, n) recorded torque per motor position for small changes about the motion.

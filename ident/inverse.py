@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.fft
@@ -61,6 +62,9 @@ class Plane:
         record: (L,) recorded torque per continuous torque.
         spring_gain: (L, n, n) motor torque per torque in parallel with a spring.
         link_gain: (L, n, N) motor torque per opposing torque on a link coordinate.
+        link_per_position: (L, M, n) motion of the links whose encoders are compared per motor position.
+        link_per_spring: (L, M, n) rad per N m in parallel with a spring.
+        link_per_load: (L, M, N) rad per N m that opposes on a link coordinate.
     """
 
     lin: Linearisation
@@ -71,6 +75,33 @@ class Plane:
     record: np.ndarray
     spring_gain: np.ndarray
     link_gain: np.ndarray
+    link_per_position: np.ndarray
+    link_per_spring: np.ndarray
+    link_per_load: np.ndarray
+
+    def outputs(self, torque: np.ndarray, link: np.ndarray) -> np.ndarray:
+        """Responses (L, n, ...) of the motor torque, as recorded, and below them (L, M, ...) those of the links."""
+        return np.concatenate([self.record[:, None, None] * torque, link], axis=1)
+
+    @cached_property
+    def output_per_position(self) -> np.ndarray:
+        """(L, n + M, n) recorded torque and link positions per motor position."""
+        return self.outputs(self.Z, self.link_per_position)
+
+    @cached_property
+    def output_per_spring(self) -> np.ndarray:
+        """(L, n + M, n) the same per torque in parallel with a spring."""
+        return self.outputs(self.spring_gain, self.link_per_spring)
+
+    @cached_property
+    def output_per_load(self) -> np.ndarray:
+        """(L, n + M, N) the same per torque that opposes on a link coordinate."""
+        return self.outputs(self.link_gain, self.link_per_load)
+
+    @cached_property
+    def output_per_motor(self) -> np.ndarray:
+        """(L, n + M, n) the same per torque at a motor."""
+        return self.outputs(np.eye(self.Z.shape[-1])[None], np.zeros_like(self.link_per_position))
 
 
 def make_plane(structure: Structure, par: Parameters, group: Group, sampling: Sampling) -> Plane:
@@ -89,7 +120,10 @@ def plane_at(
     driven = structure.driven
     link_gain = par.coupling.T @ (C[:, :, None] * A_inv[:, driven, :])
     spring_gain = par.coupling.T - link_gain[:, :, driven]
-    return Plane(lin, s, Z, A_inv, C, record, spring_gain, link_gain)
+    rows = A_inv[:, driven[list(group.links)]]
+    link_per_spring = rows[..., driven]
+    link_per_position = (link_per_spring * C[:, None]) @ par.coupling
+    return Plane(lin, s, Z, A_inv, C, record, spring_gain, link_gain, link_per_position, link_per_spring, -rows)
 
 
 @dataclass(frozen=True)
@@ -217,15 +251,18 @@ def link_motion(
 
 
 def geometric_remainder(structure: Structure, plane: Plane, group: Group, Q_a: np.ndarray) -> np.ndarray:
-    """Inverse dynamics along ``q_a`` less the linearised arm; (S, L, N) N m."""
-    s = plane.s[:, None]
+    """Inverse dynamics along ``q_a`` less the linearised arm, in its slow lines; (S, L, N) N m.
+
+    Faster than the modes of the links a fixed point of it need not be near; what is so fast there is a jump, and small.
+    """
     coarse = coarse_group(group)
-    q = coarse.to_time(Q_a)
-    v = coarse.to_time(s * Q_a)
-    a = coarse.to_time(s**2 * Q_a)
+    slow = len(coarse.omega)
+    q, v, a = (coarse.to_time(plane.s[:slow, None] ** k * Q_a[:, :slow]) for k in range(3))
     tau = inverse_dynamics(structure, q, v, a)
     linear = a @ plane.lin.M + q @ plane.lin.Kg.T
-    return coarse.to_lines(tau - linear)
+    out = np.zeros_like(Q_a)
+    out[:, :slow] = coarse.to_lines(tau - linear)
+    return out
 
 
 def inverse_dynamics(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -321,16 +358,15 @@ def _solution(
 def baseline_products(
     structure: Structure, par: Parameters, plane: Plane, solution: Solution, top: int
 ) -> Products:
-    """Derivative of the predicted torque by the log-parameters, at lines 0..top-1.
+    """Derivative of the predicted outputs by the log-parameters, at lines 0..top-1.
 
     Torques of effects and the geometric remainder are held. Columns in the order of the parameters.
     """
     n, elastic = structure.n, np.asarray(structure.elastic, int)
     s = plane.s[:top, None]
-    rec = plane.record[:top, None, None]
-    springs = rec * plane.spring_gain[:top]
-    motors = rec * np.eye(n)
-    hinges = rec * plane.link_gain[:top, :, elastic]
+    springs = plane.output_per_spring[:top]
+    motors = plane.output_per_motor[:top]
+    hinges = plane.output_per_load[:top, :, elastic]
     gains = np.concatenate(
         [
             springs * par.stiffness,
@@ -350,9 +386,10 @@ def baseline_products(
 
 
 def coarse_group(group: Group) -> Group:
-    """The group on the grid of the geometric remainder.
+    """The slow lines of a group, on the grid of the geometric remainder.
 
     Products of two signals of the compared band stay below its Nyquist frequency; those of four
     fold to its edge.
     """
-    return replace(group, n_time=scipy.fft.next_fast_len(int(REMAINDER_POINTS * len(group.omega)), real=True))
+    slow = group.slow()
+    return replace(slow, n_time=scipy.fft.next_fast_len(int(REMAINDER_POINTS * len(slow.omega)), real=True))

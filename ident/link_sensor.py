@@ -2,13 +2,14 @@
 
 The torque equation does not hold the link encoders. What they show is compared with the motion of
 the links that the model predicts along the motor motion: a delay makes the difference of the two
-encoders follow the velocity, which looks like wind-up of the gear and is not (effects.md).
+encoders follow the velocity, which looks like wind-up of the gear and is not (effects.md). What else
+they show of the gears is fitted with the torque where that hardly shows these.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +24,7 @@ EXPLAINED = 0.5  # share of what stiffness and lost motion leave that it must ex
 BLOCKS = 12  # of lines, left out one after another for the standard deviation
 SMOOTH = 8  # lines on either side over which the remaining power is averaged
 PASSES = 3  # of weighting and fitting
+LEAST_NOISE = 1e-7  # of a link encoder over its motion, where differences of samples show less
 
 
 @dataclass(frozen=True)
@@ -34,17 +36,53 @@ class LinkDelay:
     std: float
 
 
-def find_link_delays(problem: Problem, predictions: Sequence[Prediction]) -> tuple[LinkDelay, ...]:
-    """Joints whose link encoder comes late; none where there are no link encoders."""
+def comparable_links(problem: Problem) -> bool:
+    """Whether link encoders can be compared with a model: where there are motions alone.
+
+    Below the resonances of an arm its torque hardly shows the gears. Multisines pass these, and need no link encoders.
+    """
+    known = [g.link_std for g in problem.groups if g.link_std is not None]
+    return problem.motions_alone and bool(np.any(np.isfinite(known)))
+
+
+def with_link_encoders(problem: Problem, late: Sequence[LinkDelay]) -> Problem:
+    """The problem with its link encoders compared, those that come late led back in time."""
+    delay = np.zeros(problem.structure.n)
+    delay[[x.joint for x in late]] = [x.delay for x in late]
+    noise = np.fmax.reduce([g.link_std for g in problem.groups if g.link_std is not None])
+    return replace(problem, groups=tuple(_compared(group, noise, delay) for group in problem.groups))
+
+
+def _compared(group: Group, noise: np.ndarray, delay: np.ndarray) -> Group:
+    """A group with its link encoders compared: noise, rad, and delay, s, (n,) each."""
+    if group.Q_link is None:
+        return group
+    size = np.std(group.to_time(group.Q), axis=(0, 1))
+    return replace(
+        group,
+        Q_link=group.Q_link * np.exp(1j * group.omega[:, None] * delay),
+        link_std=np.maximum(noise, LEAST_NOISE * size),
+        links=tuple(int(j) for j in np.flatnonzero(np.all(np.isfinite(group.Q_link), axis=(0, 1)))),
+    )
+
+
+def find_link_delays(
+    groups: Sequence[Group], predictions: Sequence[Prediction], sample_time: float
+) -> tuple[LinkDelay, ...]:
+    """Joints whose link encoder comes late; none where there are no link encoders.
+
+    Args:
+        groups: link encoders as they were recorded.
+    """
     out = []
-    for j in range(problem.structure.n):
+    for j in range(groups[0].U.shape[-1]):
         pairs = [
             (group, pred)
-            for group, pred in zip(problem.groups, predictions, strict=True)
+            for group, pred in zip(groups, predictions, strict=True)
             if group.Q_link is not None and np.all(np.isfinite(group.Q_link[..., j]))
         ]
         found = _fit_delay(pairs, j) if pairs else None
-        if found is not None and found[0] > LEAST * problem.sampling.sample_time:
+        if found is not None and found[0] > LEAST * sample_time:
             out.append(LinkDelay(j, *found))
     return tuple(out)
 

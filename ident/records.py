@@ -29,6 +29,8 @@ POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 NOISE_LINES = 10  # lines on either side over which the noise of the position is averaged
 SIGNAL_LEVEL = 2.0  # power over noise below which a line of the position counts as noise
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
+MOTION_BAND = 1.5  # the same of motions
+FAST_BAND = 6.0  # of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,9 @@ class Group:
         U, Q: (S, L, n) mean spectra of torque (N m) and motor position (rad), lines 0..L-1.
         U_periods, Q_periods: (S, P, L, n) single periods, P >= 1.
         Q_link: (S, L, n) of the link encoders, or None.
+        link_std: (n,) sample noise of the link encoders of a motion, rad, NaN where a joint has none; or None.
+        links: joints whose link encoder is compared, M of them.
+        n_slow: lines of the motion along which the geometry of the arm is solved, all where None.
         omega: (L,) rad/s.
         n_compared: lines that are compared, K of them: 0..K-1.
         excited: (S, L) True where a segment excites.
@@ -78,6 +83,14 @@ class Group:
     white_noise: np.ndarray
     white_torque_noise: np.ndarray
     rest: np.ndarray | None = None
+    link_std: np.ndarray | None = None
+    links: tuple[int, ...] = ()
+    n_slow: int | None = None
+
+    @property
+    def outputs(self) -> np.ndarray:
+        """(S, L, n + M) what is compared: recorded torque, N m, then link positions, rad."""
+        return self.U if not self.links else np.concatenate([self.U, self.Q_link[..., list(self.links)]], axis=-1)
 
     @cached_property
     def position_noise(self) -> np.ndarray:
@@ -118,6 +131,13 @@ class Group:
         kept = {name: None if x is None else x[rows] for name, x in parts.items()}
         return replace(self, segments=tuple(self.segments[i] for i in rows), **kept)
 
+    def slow(self) -> Group:
+        """The group with the lines of the geometry alone."""
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link")
+        parts = {name: getattr(self, name) for name in names}
+        cut = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
+        return replace(self, omega=self.omega[: self.n_slow], excited=self.excited[:, : self.n_slow], n_slow=None, **cut)
+
     def to_time(self, X: np.ndarray) -> np.ndarray:
         """Spectrum (..., L, m) on the time grid (..., n_time, m)."""
         return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward")
@@ -132,6 +152,19 @@ class Group:
         if self.window is not None:
             X = self.to_lines(self.to_time(X) * self.window[:, None])
         return X[..., : self.n_compared, :]
+
+    def observe_outputs(self, X: np.ndarray) -> np.ndarray:
+        """``observe`` for outputs (S, L, n + M, ...); (S, K, n + M, ...).
+
+        The zero of a link encoder is not known: its mean over the window is left out.
+        """
+        flat = X.reshape(*X.shape[:2], -1)
+        if self.links:
+            first = self.U.shape[-1] * flat.shape[-1] // X.shape[2]
+            share = self.window**2 / np.sum(self.window**2)
+            flat = flat.copy()
+            flat[:, 0, first:] -= np.einsum("t,stm->sm", share, self.to_time(flat[..., first:]))
+        return self.observe(flat).reshape(len(X), self.n_compared, *X.shape[2:])
 
 
 def _line_noise(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
@@ -157,6 +190,7 @@ def build_groups(
     role: str | None = "identification",
     band_hz: float | None = None,
     motion_band_hz: float | None = None,
+    fast: bool = False,
 ) -> tuple[Group, ...]:
     """Groups of all segments of a role.
 
@@ -165,6 +199,7 @@ def build_groups(
         role: "identification", "validation", or None for all.
         band_hz: highest compared frequency of periodic data; the highest excited line where None.
         motion_band_hz: the same for motions; 10 Hz or a tenth of the sample rate where None.
+        fast: whether signals of motions reach past the modes of the links, as link encoders see them.
 
     Raises:
         DataError: where no segment of the role is left.
@@ -183,7 +218,7 @@ def build_groups(
     top = band_hz or highest_line_hz(dataset)
     motion_top = motion_band_hz or min(10.0, dataset.sample_rate / 10)
     return tuple(
-        _motion_group(dataset, members[0], motion_top)
+        _motion_group(dataset, members[0], motion_top, fast)
         if members[0].kind == "trajectory"
         else _periodic_group(dataset, members, top)
         for members in groups.values()
@@ -248,7 +283,7 @@ def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:
     return scipy.fft.rfft(x, axis=1, norm="forward")[:, :n_lines]
 
 
-def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
+def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool) -> Group:
     fs = dataset.sample_rate
     n_return = int(np.ceil(max(RETURN_TIME, 0.05 * len(segment.t) / fs) * fs))
     N = scipy.fft.next_fast_len(len(segment.t) + n_return, real=True)
@@ -256,7 +291,8 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
     q = close_motion(segment.q, n_return, fs, curvature=True)
     tau = close_motion(segment.tau, n_return, fs, curvature=False)
     top = min(int(band_hz * N / fs), N // 2 - 1)
-    n_lines = min(int(1.5 * top) + 2, N // 2)
+    n_slow = min(int(MOTION_BAND * top) + 2, N // 2)
+    n_lines = min(int(FAST_BAND * top) + 2, N // 2) if fast else n_slow
     # A ripple is fast along a motion that is slow: on a grid of the compared band alone it would fold into it.
     fine = min(N, scipy.fft.next_fast_len(int(MOTION_RATE * N / fs), real=True))
     n_time = max(fine, scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True))
@@ -290,6 +326,8 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float) -> Group:
         periods=np.ones(1, int),
         white_noise=difference_noise(segment.q) ** 2 / N,
         white_torque_noise=difference_noise(segment.tau) ** 2 / N,
+        link_std=None if segment.q_link is None else difference_noise(segment.q_link),
+        n_slow=n_slow,
         rest=_at_rest(segment.q, fs)[np.minimum((time * fs).astype(int), len(segment.t) - 1)],
     )
 

@@ -12,7 +12,7 @@ from ident.dataset import Dataset, Segment
 from ident.extended import Effect, Model, Prediction, predict
 from ident.frf import estimate_frf
 from ident.records import Group
-from ident.torque_fit import Fit, Problem, noise_covariance, residual
+from ident.torque_fit import Fit, Problem, noise_covariance, output_error, residual
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
 from robot_assets.errors import DataError
 
@@ -22,10 +22,11 @@ SHOWN_SECONDS = 6.0
 
 def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.05) -> tuple[Where, ...]:
     """Shares of the whitened discrepancy beyond noise by joint and kind of line, largest first."""
-    totals: dict[tuple[str, str], float] = {}
+    totals: dict[tuple[str, str, str], float] = {}
     joints = problem.structure.robot.joint_names
     for g, (group, pred) in enumerate(zip(problem.groups, predictions, strict=True)):
-        e = fit.weights.apply(g, residual(group, pred))
+        e = fit.weights.apply(g, output_error(group, pred))
+        rows = [(name, "tau") for name in joints] + [(joints[j], "q_link") for j in group.links]
         power = np.abs(e) ** 2 - 2.0
         power[:, 0] += 1.0
         line = np.arange(group.n_compared)[None, :]
@@ -39,11 +40,11 @@ def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: 
             kinds = {"motion": np.ones_like(line, bool)}
         for kind, mask in kinds.items():
             part = (power * np.broadcast_to(mask, power.shape[:2])[..., None]).sum(axis=(0, 1))
-            for j, name in enumerate(joints):
-                totals[(name, kind)] = totals.get((name, kind), 0.0) + float(max(part[j], 0.0))
+            for power_of_row, row in zip(part, rows, strict=True):
+                totals[(*row, kind)] = totals.get((*row, kind), 0.0) + float(max(power_of_row, 0.0))
     whole = sum(totals.values()) or 1.0
-    rows = [Where(j, "tau", k, v / whole) for (j, k), v in totals.items() if v / whole >= least]
-    return tuple(sorted(rows, key=lambda w: -w.share))
+    found = [Where(*key, v / whole) for key, v in totals.items() if v / whole >= least]
+    return tuple(sorted(found, key=lambda w: -w.share))
 
 
 def affected_joints(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.1) -> tuple[int, ...]:

@@ -112,6 +112,7 @@ def _rows(
     Returns:
         y (R, n); Y (R, n, 10 B); motor acceleration and velocity (R, n); friction (R, n, 2): sign and one.
     """
+    group = group.slow()
     coarse = coarse_group(group)
     s = 1j * group.omega[:, None]
     kinds = [coarse.to_time(s**k * group.Q[0]) for k in range(3)]

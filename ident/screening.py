@@ -16,7 +16,8 @@ from ident.extended import Prediction
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
 from ident.parallel import map_threads
-from ident.torque_fit import Fit, Problem, as_real, jacobian, observe_columns, residual
+from ident.records import Group
+from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
@@ -111,8 +112,8 @@ class _Stage:
     def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
         def whitened(g: int) -> tuple[np.ndarray, np.ndarray]:
             group, pred = problem.groups[g], predictions[g]
-            J = observe_columns(group, jacobian(problem, fit.model, group, pred).dense())
-            return fit.weights.apply(g, residual(group, pred)), fit.weights.apply(g, J)
+            J = group.observe_outputs(jacobian(problem, fit.model, group, pred).dense())
+            return fit.weights.apply(g, output_error(group, pred)), fit.weights.apply(g, J)
 
         residuals, columns = zip(*map_threads(whitened, range(len(problem.groups))), strict=True)
         real = [as_real(J) for J in columns]
@@ -152,7 +153,7 @@ class _Field:
     @classmethod
     def build(cls, stage: _Stage, g: int, channel: str, joint: int) -> _Field:
         group, pred = stage.problem.groups[g], stage.predictions[g]
-        torque = stage.fit.weights.apply(g, _gain(pred, channel, joint)[None, : group.n_compared])[0]
+        torque = stage.fit.weights.apply(g, _gain(group, pred, channel, joint)[None, : group.n_compared])[0]
         residual = np.einsum("kn,skn->sk", torque.conj(), stage.residuals[g])
         columns = np.matmul(torque.conj()[:, None, :], stage.columns[g])[..., 0, :]
         return cls(torque, residual, columns)
@@ -196,7 +197,7 @@ def _score(
             if group.window is None:
                 sums = _line_sums([(fields[g][c], X[:, : group.n_compared]) for c, X in parts])
             else:
-                sums = _whole_sums(stage, g, sum(_gain(pred, c, h.joint)[None, :, :, None] * X[:, :, None] for c, X in parts))
+                sums = _whole_sums(stage, g, sum(_gain(group, pred, c, h.joint)[None, :, :, None] * X[:, :, None] for c, X in parts))
         total = sums if total is None else total + sums
     if total is None:
         return None
@@ -216,8 +217,8 @@ def _lines(motion: Motion, signals: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _whole_sums(stage: _Stage, g: int, units: np.ndarray) -> _Sums:
-    """Sums of recorded torque spectra (S, L, n, m)."""
-    X = stage.fit.weights.apply(g, observe_columns(stage.problem.groups[g], units)).reshape(-1, units.shape[-1])
+    """Sums of output spectra (S, L, n + M, m)."""
+    X = stage.fit.weights.apply(g, stage.problem.groups[g].observe_outputs(units)).reshape(-1, units.shape[-1])
     J, r = stage.columns[g].reshape(-1, len(stage.moment)), stage.residuals[g].ravel()
     return _Sums((X.conj().T @ X).real, (X.conj().T @ r).real, (J.conj().T @ X).real)
 
@@ -243,19 +244,19 @@ def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | Non
     return None if p is None or not np.all(np.isfinite(p)) else np.asarray(p, float)
 
 
-def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:
-    """Recorded torque per unit of a signal of a channel at a joint; (L, n)."""
-    rec = pred.plane.record[:, None]
-    unit = np.eye(pred.structure.n)[joint]
+def _gain(group: Group, pred: Prediction, channel: str, joint: int) -> np.ndarray:
+    """Recorded torque and link positions per unit of a signal of a channel at a joint; (L, n + M)."""
+    plane = pred.plane
     if channel == "motor":
-        return rec * unit
+        return plane.output_per_motor[:, :, joint]
     if channel == "spring":
-        return rec * pred.plane.spring_gain[:, :, joint]
+        return plane.output_per_spring[:, :, joint]
     if channel == "link":
-        return rec * pred.plane.link_gain[:, :, pred.structure.driven[joint]]
+        return plane.output_per_load[:, :, pred.structure.driven[joint]]
     if channel == "position":
-        return rec * pred.plane.Z[:, :, joint]
-    return np.broadcast_to(unit.astype(complex), (len(rec), pred.structure.n))
+        return plane.output_per_position[:, :, joint]
+    unit = np.eye(group.outputs.shape[-1], dtype=complex)[joint]
+    return np.broadcast_to(unit, (len(group.omega), len(unit)))
 
 
 def wave_numbers(problem: Problem, predictions: Sequence[Prediction], joint: int) -> tuple[float, ...]:

@@ -382,8 +382,8 @@ def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis,
     model = replace(result.model, effects=(*others, replace(last, hypothesis=loop)))
     other = refit(problem, model, result.weights, result.remainders, FIRST_STEPS)
     # At the joint itself: another cause may be elsewhere.
-    noise, j = result.count / problem.structure.n, h.joint
-    if other is not None and other.costs[j] < max(DETECTION_EXCESS * noise, AS_GOOD * result.costs[j]):
+    j = h.joint
+    if other is not None and other.costs[j] < max(DETECTION_EXCESS * result.counts[j], AS_GOOD * result.costs[j]):
         return loop, other
     return h, result
 

@@ -29,6 +29,7 @@ HELD, HOLD = 0.1, 0.04  # error added to the noise from which drives are held, a
 ANNEALING = (0.5, 0.1, 0.02, 0.0)
 LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
 STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
+LINK_ERROR = 0.01  # of the wind-up that link encoders show, up to which what a model leaves is an error of its law
 GAP = 1e-6  # relative change of the cost that ends a fit
 LEAST_NOISE = 0.5  # of the noise of a linear arm, that is left in any direction of the residual
 LEAST_INFORMATION = 1e-12  # on a coordinate: less counts as this
@@ -72,13 +73,13 @@ class Problem:
 
 @dataclass(frozen=True)
 class Weights:
-    """(K, n, n) whitening per group: real and imaginary parts of residuals have unit variance under noise."""
+    """(K, n + M, n + M) whitening per group: real and imaginary parts of residuals have unit variance under noise."""
 
     whiten: tuple[np.ndarray, ...]
     covariance: tuple[np.ndarray, ...]
 
     def apply(self, g: int, X: np.ndarray) -> np.ndarray:
-        """Whiten (S, K, n) or (S, K, n, p), complex as given."""
+        """Whiten outputs (S, K, n + M) or (S, K, n + M, p), complex as given."""
         if X.ndim == 4:
             return np.matmul(self.whiten[g], X)
         return np.matmul(self.whiten[g], X[..., None])[..., 0]
@@ -91,7 +92,7 @@ class Fit:
     Attributes:
         model: chain, parameters and effects at the minimum.
         costs: (n,) whitened sum of squares by joint, prior excluded.
-        count: real data that entered.
+        counts: (n,) real data that entered.
         information: (p, p) normal matrix of the fitted coordinates, prior excluded.
         names: of the fitted coordinates.
         remainders: geometric remainder per group, for warm starts.
@@ -102,7 +103,7 @@ class Fit:
 
     model: Model
     costs: np.ndarray
-    count: int
+    counts: np.ndarray
     information: np.ndarray
     names: tuple[str, ...]
     remainders: tuple[np.ndarray, ...]
@@ -113,6 +114,10 @@ class Fit:
     @property
     def cost(self) -> float:
         return float(np.sum(self.costs))
+
+    @property
+    def count(self) -> int:
+        return int(np.sum(self.counts))
 
     @property
     def chi2_per_dof(self) -> float:
@@ -161,6 +166,22 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
     return S
 
 
+def output_covariance(problem: Problem, group: Group, prediction: Prediction) -> np.ndarray:
+    """The same of all outputs: noise of a motor position is in the torque and in what a link encoder differs by; (K, n + M, n + M)."""
+    S = noise_covariance(problem, group, prediction)
+    n, links, samples = S.shape[-1], list(group.links), problem.samples(group)
+    if not links:
+        return S
+    position = (problem.q_std**2 + np.square(problem.step_std)) / samples
+    all_of_it = white_covariance(
+        prediction.plane.output_per_position[: len(S)],
+        np.concatenate([np.zeros(n), group.link_std[links] ** 2 / samples]),
+        position,
+    )
+    all_of_it[:, :n, :n] = S
+    return all_of_it
+
+
 def _with_record(S: np.ndarray, more: np.ndarray) -> np.ndarray:
     """A covariance (K, n, n) and what answers to the record add to it, by draws.
 
@@ -183,13 +204,16 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
     """
     whiten, covariance = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
-        S = noise_covariance(problem, group, pred)
+        S = output_covariance(problem, group, pred)
         k = np.arange(S.shape[1])
         S[0] *= 4.0
+        power = np.mean(np.abs(_signals(group, pred)[:, : group.n_compared]) ** 2, axis=0)
         if rho > 0:
-            power = np.mean(np.abs(group.U[:, : group.n_compared]) ** 2, axis=0)
-            power[1:] += 1e-2 * power[1:].mean(axis=0)
             S[:, k, k] += rho**2 * power
+            S[1:, k, k] += 1e-2 * rho**2 * power[1:].mean(axis=0)
+        links = k[problem.structure.n :]
+        left = np.mean(np.abs(output_error(group, pred)[:, 1:, links]) ** 2, axis=(0, 1)) - S[1:, links, links].real.mean(axis=0)
+        S[:, links, links] += np.clip(left, 0.0, LINK_ERROR**2 * power[1:, links].mean(axis=0))
         root = np.linalg.inv(np.linalg.cholesky(S)) * np.sqrt(2.0)
         root[0] /= np.sqrt(2.0)
         whiten.append(root)
@@ -197,19 +221,39 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
     return Weights(tuple(whiten), tuple(covariance))
 
 
+def _signals(group: Group, prediction: Prediction) -> np.ndarray:
+    """(S, L, n + M) what errors of a model are relative to: the torque, and the wind-up of the gears that link encoders show."""
+    signals = group.outputs.copy()
+    windup = signals[..., group.U.shape[-1] :]
+    windup -= (group.Q @ prediction.par.coupling.T)[..., list(group.links)]
+    windup[:, 0] = 0.0
+    return signals
+
+
 def residual(group: Group, prediction: Prediction) -> np.ndarray:
     """Measured less predicted recorded torque at the compared lines; (S, K, n) complex, N m."""
     return group.observe(group.U - prediction.U)
 
 
+def output_error(group: Group, prediction: Prediction) -> np.ndarray:
+    """The same of all outputs; (S, K, n + M) complex, N m and rad."""
+    return group.observe_outputs(group.outputs - prediction.outputs(group))
+
+
+def data_counts(problem: Problem) -> np.ndarray:
+    """Real numbers that are compared, by joint; (n,)."""
+    total = np.zeros(problem.structure.n)
+    for group in problem.groups:
+        share = 1.0 if group.window is None else float(np.mean(group.window**2))
+        each = share * len(group.segments) * (2 * group.n_compared - 1)
+        total += each
+        total[list(group.links)] += each
+    return total
+
+
 def data_count(problem: Problem) -> int:
     """Real numbers that are compared."""
-    total = 0
-    for group in problem.groups:
-        S, n = len(group.segments), group.U.shape[-1]
-        share = 1.0 if group.window is None else float(np.mean(group.window**2))
-        total += int(share * S * n * (2 * group.n_compared - 1))
-    return total
+    return int(np.sum(data_counts(problem)))
 
 
 def coordinate_names(model: Model) -> tuple[str, ...]:
@@ -250,7 +294,8 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> 
     extra = len(pred.structure.elastic) - n_e
     keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
     base = baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
-    late = pred.plane.s[:top, None] * pred.solution.U[:, :top]
+    late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
+    late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
     if joints_along_record(model, group):
         later = replace(model, par=replace(model.par, timing=model.par.timing + TIMING_STEP))
         late = (predict(later, group, problem.sampling, W=pred.solution.W).U - pred.U)[:, :top] / TIMING_STEP
@@ -286,7 +331,7 @@ def _beside_gears(
         x = pack(model)
         x[c] += 1e-3
         there = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W, torques=pred.solution.torques)
-        moved.append((c, (there.U - pred.U)[:, : columns.whole.shape[1]] / 1e-3))
+        moved.append((c, (there.outputs(group) - pred.outputs(group))[:, : columns.whole.shape[1]] / 1e-3))
     if not moved:
         return columns
     kept = np.setdiff1d(columns.product_at, [c for c, _ in moved])
@@ -328,7 +373,7 @@ def compared_lines(group: Group) -> int:
 def _effect_columns(
     problem: Problem, model: Model, group: Group, pred: Prediction, i: int
 ) -> list[np.ndarray]:
-    """Derivatives (S, L, n) of the predicted torque by the coordinates of effect ``i``, by differences."""
+    """Derivatives (S, L, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences."""
     effect = model.effects[i]
     h, steps = effect.hypothesis, []
     for c, q in enumerate(h.parameters):
@@ -346,12 +391,12 @@ def _effect_columns(
     ]
     W, sampling = pred.solution.W, problem.sampling
     if h.channel == "model":
-        base = predict(model, group, sampling, W=W, steps=1).U
-        moved = [predict(m, group, sampling, W=W, steps=1).U for m in models]
+        base = predict(model, group, sampling, W=W, steps=1)
+        moved = [predict(m, group, sampling, W=W, steps=1) for m in models]
     else:
-        base = pred.U
-        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, sampling, W=W, torques=pred.solution.torques).U for m in models]
-    return [(U - base) / step for U, (_, step) in zip(moved, steps, strict=True)]
+        base = pred
+        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, sampling, W=W, torques=pred.solution.torques) for m in models]
+    return [(there.outputs(group) - base.outputs(group)) / step for there, (_, step) in zip(moved, steps, strict=True)]
 
 
 def _motor_columns(
@@ -367,7 +412,7 @@ def _motor_columns(
         X = pred.plane.record * motion.lines(h.law(p, motion, j, k) - now)
         for drive in drives:
             X = _change_passed(drive, motion, X)
-        out = np.zeros_like(pred.U)
+        out = np.zeros((*pred.U.shape[:2], model.structure.n + len(group.links)), complex)
         out[..., j] = X / step
         columns.append(out)
     return columns
@@ -494,7 +539,7 @@ def fit(
     if np.any(drift):
         model, preds, Ws, _ = _settled(problem, settled, model, weights)
     H, _ = _normal(problem, model, preds, weights)
-    return Fit(model, joint_costs(problem, preds, weights), count, H, coordinate_names(model), tuple(Ws), weights, converged)
+    return Fit(model, joint_costs(problem, preds, weights), data_counts(problem), H, coordinate_names(model), tuple(Ws), weights, converged)
 
 
 Settled = tuple[Model, list[Prediction], list[np.ndarray], float]
@@ -568,17 +613,18 @@ def predictions(
 
 
 def weighted_cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
-    """Whitened sum of squares of the torque residual."""
+    """Whitened sum of squares of the errors of all outputs."""
     return float(np.sum(joint_costs(problem, preds, weights)))
 
 
 def joint_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
-    """The same by joint; (n,)."""
-    errors = (
-        weights.apply(g, residual(group, pred))
-        for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
-    )
-    return np.sum([np.sum(np.abs(e) ** 2, axis=(0, 1)) for e in errors], axis=0)
+    """The same by joint, its link encoder included; (n,)."""
+    total = np.zeros(problem.structure.n)
+    for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
+        each = np.sum(np.abs(weights.apply(g, output_error(group, pred))) ** 2, axis=(0, 1))
+        total += each[: len(total)]
+        total[list(group.links)] += each[len(total) :]
+    return total
 
 
 def _normal(
@@ -586,10 +632,10 @@ def _normal(
 ) -> tuple[np.ndarray, np.ndarray]:
     def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
         group, pred = problem.groups[g], preds[g]
-        columns, error = jacobian(problem, model, group, pred), residual(group, pred)
+        columns, error = jacobian(problem, model, group, pred), output_error(group, pred)
         if group.window is None:
             return columns.normal(weights.whiten[g], error)
-        J = as_real(weights.apply(g, observe_columns(group, columns.dense())))
+        J = as_real(weights.apply(g, group.observe_outputs(columns.dense())))
         r = as_real(weights.apply(g, error)[..., None])[:, 0]
         return J.T @ J, J.T @ r
 
@@ -603,12 +649,3 @@ def as_real(X: np.ndarray) -> np.ndarray:
     out = np.empty((2 * len(X), X.shape[-1]))
     out[: len(X)], out[len(X) :] = X.real, X.imag
     return out
-
-
-def observe_columns(group: Group, X: np.ndarray) -> np.ndarray:
-    """``Group.observe`` for (S, L, n, p)."""
-    if group.window is None:
-        return X[:, : group.n_compared]
-    S, L, n, p = X.shape
-    out = group.observe(X.reshape(S, L, n * p))
-    return out.reshape(S, -1, n, p)

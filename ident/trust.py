@@ -21,8 +21,10 @@ CARRIED = 0.8  # the same where it explains the data that it was fitted to down 
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
 SHORT = 0.25  # by which the gap closed on held-out data may fall short of what the fitted ones promise
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
+SAME_PERIOD = 0.01  # relative, of two ripples
 FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band for its name to be trusted
 SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
+HARMONIC = 0.1  # the same of a ripple at a multiple of the periods of another one
 SHADOW = 1e-3  # the same of any other cause at the joint: errors of a law of a few per cent
 HALF_TRUSTED = 0.1  # share of the discrepancy left, a third of its amplitude, at which a name is as likely wrong as right
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
@@ -35,7 +37,7 @@ def _at(h: Hypothesis, costs: np.ndarray) -> float:
 
 def _excess(result: Fit, level: float) -> np.ndarray:
     """(n,) whitened cost of a fit by joint beyond ``level`` times the noise."""
-    return np.maximum(result.costs - level * result.count / len(result.costs), 0.0)
+    return np.maximum(result.costs - level * result.counts, 0.0)
 
 
 def left_of(h: Hypothesis, result: Attribution) -> float:
@@ -108,10 +110,24 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
         o = other.candidates[0].hypothesis
         if other is found or o.joint != h.joint or o.channel == "model" or o.decoy:
             continue
-        same = element(o) is not None and element(o) == element(h)
-        if fall(found) < (SHADOW_OF_LAW if same else SHADOW) * fall(other):
+        least = SHADOW
+        if element(o) is not None and element(o) == element(h):
+            least = SHADOW_OF_LAW
+        if overtone(found, other):
+            least = HARMONIC
+        if fall(found) < least * fall(other):
             return True
     return False
+
+
+def overtone(found: Round, other: Round) -> bool:
+    """Whether the ripple of a cause has a multiple of the periods of another one: no ripple of a machine is a sine."""
+    best = [x.candidates[0] for x in (found, other)]
+    if not all(RIPPLE in [q.name for q in c.hypothesis.parameters] for c in best):
+        return False
+    waves = [e.value(RIPPLE) for c in best for e in c.fit.model.effects if e.hypothesis.key == c.hypothesis.key]
+    ratio = waves[0] / waves[1]
+    return round(ratio) >= 1 and abs(ratio - round(ratio)) < SAME_PERIOD * ratio
 
 
 def element(h: Hypothesis) -> str | None:

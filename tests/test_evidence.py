@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import Round, outdone, pruned, with_name
+from ident.attribute import LEFT_TO_DECOYS, Round, left_share, outdone, pruned, with_name
 from ident.baseline import astray
 from ident.diagnose import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
@@ -110,6 +110,29 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
     assert not shadowed(far, (soft, far))
 
 
+@pytest.mark.parametrize(("periods", "left", "expected"), [(3770.0, 95.0, True), (3770.0, 0.0, False), (3000.0, 95.0, False)])
+def test_a_weak_ripple_at_a_multiple_of_the_periods_of_another_is_its_overtone(named, periods, left, expected):
+    """No ripple of a machine is a sine: the second harmonic of a cogging is no error of the transmission."""
+
+    def round_of(h, before, after, n):
+        p = np.array([n if q.name == "periods_per_rev" else 1.0 for q in h.parameters])
+        model = SimpleNamespace(effects=(Effect(h, p),))
+        costs = [np.full(6, 10.0), np.full(6, 10.0)]
+        costs[0][2], costs[1][2] = before, after
+        return Round(SimpleNamespace(costs=costs[0]), (Candidate(h, SimpleNamespace(costs=costs[1], model=model), 0.0),), (), 1.0, 1.0)
+
+    first = round_of(named["cogging", "elbow_joint"], 2100.0, 100.0, 1885.0)
+    second = round_of(named["transmission_error", "elbow_joint"], 100.0 if left else 500.0, left, periods)
+    assert shadowed(second, (first, second)) is expected
+    assert not shadowed(first, (first, second))
+
+
+def test_what_is_left_is_a_share_of_the_excess_over_noise():
+    first, near, far = (SimpleNamespace(chi2_per_dof=x) for x in (9488.0, 7.2, 400.0))
+    assert left_share(first, near) < LEFT_TO_DECOYS < left_share(first, far)
+    assert left_share(first, first) == pytest.approx(1.0, abs=1e-4) and left_share(first, SimpleNamespace(chi2_per_dof=1.05)) == 0.0
+
+
 def test_an_encoder_that_is_off_its_centre_errs_by_the_true_angle(identified):
     _, setup, result = identified
     group = setup.problem.groups[0]
@@ -147,7 +170,7 @@ def test_signals_summed_line_by_line_are_those_of_whole_torques(identified, chan
     X, M = (rng.normal(size=shape) + 1j * rng.normal(size=shape) for _ in range(2))
     parts = [(channel, X), ("motor", M)]
     quick = _line_sums([(_Field.build(stage, 0, c, 3), x[:, : group.n_compared]) for c, x in parts])
-    whole = _whole_sums(stage, 0, sum(_gain(pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts))
+    whole = _whole_sums(stage, 0, sum(_gain(stage.problem.groups[0], pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts))
     for name in ("own", "residual", "columns"):
         a, b = getattr(quick, name), getattr(whole, name)
         assert np.abs(a - b).max() < 1e-10 * np.abs(b).max()

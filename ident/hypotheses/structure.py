@@ -17,7 +17,6 @@ from ident.graybox import (
     Structure,
     build_structure,
     equilibrium,
-    impedance,
     linearise,
 )
 from ident.hypotheses import kernels
@@ -272,7 +271,8 @@ def joint_coupling(source: int, target: int, place: str) -> Hypothesis:
         wide = plane_at(structure, turned, plane.lin, group, plane.record)
         moved = solve(structure, turned, wide, group, None, Q=solution.Q, W=solution.W)
         still = solve(structure, par, plane, group, None, Q=solution.Q, W=solution.W)
-        return [(moved.U - still.U) / step]
+        seen = structure.driven[list(group.links)]
+        return [np.concatenate([moved.U - still.U, (moved.Q_a - still.Q_a)[..., seen]], axis=-1) / step]
 
     return Hypothesis(
         "joint_coupling",
@@ -302,7 +302,7 @@ def link_friction(joint: int, place: str) -> Hypothesis:
     def responses(structure, par, plane, group, solution, shape):
         c = structure.driven[joint]
         rate = plane.s * solution.Q_a[..., c]
-        return [plane.record[:, None] * plane.link_gain[:, :, c] * rate[..., None]]
+        return [plane.output_per_load[:, :, c] * rate[..., None]]
 
     return Hypothesis(
         "unknown:link_friction",
@@ -354,10 +354,10 @@ def compliance(
     def responses(structure, par, plane, group, solution, shape):
         wide, wide_par = apply_change(structure, par, Change(elasticities=(hinge(at(structure, group, *shape)),)))
         lin = linearise(wide, equilibrium(wide, wide_par, group.posture))
-        Z, _, _ = impedance(wide, wide_par, lin, plane.s)
-        unit = np.matmul(Z - plane.Z, solution.Q[..., None])[..., 0]
+        there = plane_at(wide, wide_par, lin, group, plane.record)
+        unit = np.matmul(there.output_per_position - plane.output_per_position, solution.Q[..., None])[..., 0]
         unit[:, 0] = 0.0
-        return [plane.record[:, None] * unit]
+        return [unit]
 
     where = "before its own turn" if before else "after its own turn"
     return Hypothesis(
@@ -405,14 +405,14 @@ def _inertial_responses(
     group: Group,
     solution: Solution,
 ) -> list[np.ndarray]:
-    """Recorded torques (S, L, n) per unit of inertial parameters added to a body.
+    """Recorded torques and link positions (S, L, n + M) per unit of inertial parameters added to a body.
 
     ``columns`` hold dynamic parameters [m, m c, I] (10,) in the frame of the joint; inverse dynamics is
     linear in them, so that a response is a difference of two inverse dynamics.
     """
     coarse = coarse_group(group)
-    s = plane.s[:, None]
-    motion = [coarse.to_time(s**k * solution.Q_a) for k in range(3)]
+    slow = len(coarse.omega)
+    motion = [coarse.to_time(plane.s[:slow, None] ** k * solution.Q_a[:, :slow]) for k in range(3)]
     without = inverse_dynamics(structure, *motion)
     out = []
     for column in columns:
@@ -420,8 +420,9 @@ def _inertial_responses(
         model.inertias[joint] = pin.Inertia.FromDynamicParameters(
             model.inertias[joint].toDynamicParameters() + column
         )
-        lines = coarse.to_lines(inverse_dynamics(replace(structure, model=model), *motion) - without)
-        out.append(plane.record[:, None] * np.matmul(plane.link_gain, lines[..., None])[..., 0])
+        lines = np.zeros_like(solution.Q_a)
+        lines[:, :slow] = coarse.to_lines(inverse_dynamics(replace(structure, model=model), *motion) - without)
+        out.append(np.matmul(plane.output_per_load, lines[..., None])[..., 0])
     return out
 
 

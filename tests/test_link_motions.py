@@ -1,0 +1,101 @@
+"""Laws of the gear in motions, which link encoders show and the torque hardly does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.diagnose import diagnose, set_up
+from ident.link_sensor import LinkDelay, comparable_links, with_link_encoders
+from ident.torque_fit import Model, data_count, data_counts, jacobian, pack, predictions, unpack
+from sim import run_experiment
+from sim.effects import parse_effect
+from sim.experiment import draw_drives
+from tests.conftest import small_plan, through_files
+
+
+def motions(robot, seed, hidden, folder):
+    """Three motions of an arm with link encoders, the last held out."""
+    plans = [
+        small_plan(robot, seed + k, points=1, levels=(1.0,), validation_points=0, trajectory=True) for k in range(3)
+    ]
+    roles = ("identification", "identification", "validation")
+    moves = tuple(
+        replace(p.trajectories[0], name=f"motion-{k}", role=role) for k, (p, role) in enumerate(zip(plans, roles, strict=True))
+    )
+    drives = draw_drives(np.random.default_rng(seed), robot)
+    data = run_experiment(replace(plans[0], trajectories=moves), hidden, seed=seed, drives=drives, link_encoders=True)
+    return through_files(replace(data, segments=tuple(s for s in data.segments if s.kind == "trajectory")), folder)
+
+
+@pytest.fixture(scope="module")
+def still(ur10, tmp_path_factory):
+    """Motions with nothing hidden."""
+    return motions(ur10, 21, [], tmp_path_factory.mktemp("motions"))
+
+
+@pytest.mark.parametrize(
+    ("text", "figure", "value"),
+    [
+        ("hardening_stiffness@shoulder_lift_joint:cubic=3e10", "cubic", 3e10),
+        pytest.param("backlash@shoulder_pan_joint:gap=4e-4", "gap", 4e-4, marks=pytest.mark.slow),
+    ],
+)
+def test_a_law_of_the_gear_is_named_by_link_encoders(ur10, tmp_path, text, figure, value):
+    data = motions(ur10, 21, [parse_effect(text, ur10)], tmp_path)
+    (cause,) = [c for c in diagnose(data).causes if c.probability > 0.5]
+    assert f"{cause.effect}@{cause.joint}" == text.split(":")[0] and cause.probability > 0.8
+    assert cause.parameters[figure].value == pytest.approx(value, rel=0.02)
+
+
+def test_link_encoders_with_nothing_hidden_bring_no_cause(still):
+    verdict = diagnose(still)
+    assert not verdict.causes and not verdict.discrepancy.detected
+
+
+def linked(data, late=()):
+    setup = set_up(data, fast=True)
+    return replace(setup, problem=with_link_encoders(setup.problem, late))
+
+
+def test_links_move_with_the_drives_as_the_jacobian_says(still):
+    """To the change of the equilibrium, which moves the linear arm too and is left to the next step."""
+    problem = linked(still).problem
+    model, n = Model(problem.structure, problem.nominal), problem.structure.n
+    preds = predictions(problem, model, [None] * len(problem.groups), steps=None)
+    group, pred = problem.groups[0], preds[0]
+    J, x = jacobian(problem, model, group, pred).dense()[:, :, n:], pack(model)
+    for i in range(2 * n):  # springs and dampers of the gears
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = x.copy()
+            moved[i] += sign * 1e-4
+            there = predictions(problem, unpack(model, moved, np.inf), [p.solution.W for p in preds])
+            ends.append(there[0].outputs(group)[..., n:])
+        slope = (ends[0] - ends[1]) / 2e-4
+        assert np.linalg.norm(J[..., i] - slope) < 1e-2 * np.linalg.norm(slope)
+    assert not np.any(J[..., 2 * n : 4 * n]), "motors do not move the links along a given motion"
+
+
+def test_the_zero_of_a_link_encoder_does_not_count_and_its_delay_is_taken_back(still):
+    group = linked(still).problem.groups[0]
+    moved = group.outputs.copy()
+    moved[:, 0, -1] += 0.1
+    seen, same = group.observe_outputs(moved), group.observe_outputs(group.outputs)
+    assert np.abs(seen - same).max() < 1e-12 and np.abs(same[..., -1]).max() > 1e-3
+    late = linked(still, (LinkDelay(2, 3e-3, 1e-5),)).problem.groups[0]
+    assert late.Q_link[..., 2] == pytest.approx(group.Q_link[..., 2] * np.exp(3e-3j * group.omega))
+    assert np.array_equal(late.Q_link[..., 3], group.Q_link[..., 3])
+
+
+def test_link_encoders_count_at_their_joints(still):
+    problem = linked(still).problem
+    torque = replace(problem, groups=tuple(replace(g, links=()) for g in problem.groups))
+    some = replace(problem, groups=tuple(replace(g, links=(1, 4)) for g in problem.groups))
+    assert data_count(problem) == pytest.approx(2 * data_count(torque), rel=1e-6)
+    assert data_counts(some) / data_counts(torque) == pytest.approx([1, 2, 1, 1, 2, 1])
+
+
+def test_multisines_are_compared_without_link_encoders(ur10, tmp_path):
+    data = run_experiment(small_plan(ur10, 13, points=1, levels=(1.0,)), [], seed=13, link_encoders=True)
+    assert not comparable_links(set_up(through_files(data, tmp_path)).problem)
