@@ -251,8 +251,9 @@ def settled(current: Fit) -> bool:
 def companions(
     problem: Problem, current: Fit, winner: Candidate, hypotheses: Sequence[Hypothesis]
 ) -> tuple[Fit, list[Round]]:
-    """The effect just named at other joints too, where at least two of them ask for it: friction of a real arm.
+    """A friction just named at other joints too, where at least two of them ask for it: a real arm has it at all.
 
+    Nothing else: what one ripple shakes at all joints, others of periods found freely would each explain at their own.
     Each must explain ``MIN_SHARE`` of what is left at its own joint, and all are fitted together. A single
     one is left to the next round, where it competes.
 
@@ -261,7 +262,7 @@ def companions(
     """
     effect = winner.hypothesis.effect
     same = [h for h in hypotheses if h.effect == effect and h.joint >= 0 and h.key != winner.hypothesis.key]
-    if len(same) < 2:
+    if "friction" not in effect or len(same) < 2:
         return current, []
     preds = predictions(problem, current.model, current.remainders)
     noise = current.counts

@@ -196,6 +196,11 @@ class Motion:
         """Recorded motor torque without lines of noise alone, N m."""
         return self._time(self.group.U, joint, share=self.group.torque_share[..., joint])
 
+    def peak_torque(self, joint: int) -> float:
+        """Largest recorded motor torque, N m; the return that closes a motion was not recorded."""
+        u = np.abs(self.torque(joint))
+        return float(np.max(u if self.group.window is None else u[:, self.group.window > 0.0]))
+
     def asked(self, joint: int) -> np.ndarray:
         """Torque that the record leaves to a friction of the motor, N m."""
         s, x = 1j * self.group.omega, self.solution

@@ -54,7 +54,7 @@ def signal_scale(
         delta.append(np.abs(motion.delta(joint)).ravel()[::7])
         u = motion.torque(joint)
         torque.append(np.mean((u - u.mean(axis=1, keepdims=True)) ** 2))
-        peak.append(np.abs(u).max())
+        peak.append(motion.peak_torque(joint))
         r = group.to_time((group.U - pred.U)[..., joint : joint + 1])
         res.append(np.mean(r**2))
         starts += [*group.start, *(group.start + group.period_time)]

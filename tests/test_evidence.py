@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import LEFT_TO_DECOYS, Round, left_share, outdone, pruned, with_name
+from ident.attribute import LEFT_TO_DECOYS, Round, companions, left_share, outdone, pruned, with_name
 from ident.baseline import astray
 from ident.diagnose import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
@@ -315,3 +315,10 @@ def test_what_the_data_do_not_feel_keeps_its_spread_before_them(identified):
     nothing = replace(result, information=0.0 * result.information)
     std = np.sqrt(np.diag(nothing.covariance()))[: len(result.model.par.to_log())]
     assert std == pytest.approx(PRIOR_LOG_STD)
+
+
+def test_ripples_are_named_at_one_joint_after_another(named):
+    """A ripple shakes all joints: others of periods found freely would each explain some of that at their own."""
+    ripple = Candidate(named["transmission_error", "elbow_joint"], None, 0.0, 1.0)
+    untouched = SimpleNamespace()
+    assert companions(None, untouched, ripple, tuple(named.values())) == (untouched, [])

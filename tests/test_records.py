@@ -101,3 +101,18 @@ def test_friction_at_rest_is_what_the_drive_asks_of_it(tmp_path):
     lines = group.observe(group.U)
     parts = stretch_squares(group, lines, 8)
     assert parts.shape == (8, 1) and parts.mean(axis=0) == pytest.approx(mean_squares(np.abs(lines) ** 2)[0], rel=1e-9)
+
+
+def test_limits_of_the_torque_are_sought_below_what_was_recorded():
+    """A motion that is cut while the torque rises: its return swings far beyond, and was never asked of the motor."""
+    bench, fs = load_robot("twomass"), RATE
+    t = np.arange(int(6 * fs)) / fs
+    q, tau = 0.2 * np.sin(2 * np.pi * 0.7 * t), 3.0 * np.sin(2 * np.pi * 0.7 * t + 0.5)
+    rng = np.random.default_rng(1)
+    segment = Segment("m", "trajectory", "identification", t, tau[:, None] + 1e-3 * rng.normal(size=(t.size, 1)), q[:, None])
+    data = Dataset("cut", "twomass", bench, fs, bench.joint_names, "zoh", np.array([1e-6]), np.array([1e-3]), None, (segment,))
+    setup = set_up(data)
+    (group,) = setup.problem.groups
+    motion = predict(Model(setup.problem.structure, setup.problem.nominal), group, setup.problem.sampling).motion(group)
+    assert np.abs(motion.torque(0)).max() > 1.5 * 3.0
+    assert motion.peak_torque(0) == pytest.approx(3.0, rel=0.05)

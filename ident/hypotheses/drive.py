@@ -92,7 +92,7 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
 
     def excess(limit: float, motion: Motion, j: int) -> np.ndarray:
         u = motion.torque(j)
-        limit = max(limit, LEAST_LIMIT * float(np.abs(u).max()))
+        limit = max(limit, LEAST_LIMIT * motion.peak_torque(j))
         return u - np.clip(u, -limit, limit)
 
     return Hypothesis(
