@@ -16,7 +16,6 @@ from ident.extended import Prediction
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
 from ident.parallel import map_threads
-from ident.records import Group
 from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
@@ -153,7 +152,7 @@ class _Field:
     @classmethod
     def build(cls, stage: _Stage, g: int, channel: str, joint: int) -> _Field:
         group, pred = stage.problem.groups[g], stage.predictions[g]
-        torque = stage.fit.weights.apply(g, _gain(group, pred, channel, joint)[None, : group.n_compared])[0]
+        torque = stage.fit.weights.apply(g, _gain(pred, channel, joint)[None, : group.n_compared])[0]
         residual = np.einsum("kn,skn->sk", torque.conj(), stage.residuals[g])
         columns = np.matmul(torque.conj()[:, None, :], stage.columns[g])[..., 0, :]
         return cls(torque, residual, columns)
@@ -197,7 +196,7 @@ def _score(
             if group.window is None:
                 sums = _line_sums([(fields[g][c], X[:, : group.n_compared]) for c, X in parts])
             else:
-                sums = _whole_sums(stage, g, sum(_gain(group, pred, c, h.joint)[None, :, :, None] * X[:, :, None] for c, X in parts))
+                sums = _whole_sums(stage, g, sum(_gain(pred, c, h.joint)[None, :, :, None] * X[:, :, None] for c, X in parts))
         total = sums if total is None else total + sums
     if total is None:
         return None
@@ -244,7 +243,7 @@ def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | Non
     return None if p is None or not np.all(np.isfinite(p)) else np.asarray(p, float)
 
 
-def _gain(group: Group, pred: Prediction, channel: str, joint: int) -> np.ndarray:
+def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:
     """Recorded torque and link positions per unit of a signal of a channel at a joint; (L, n + M)."""
     plane = pred.plane
     if channel == "motor":
@@ -255,8 +254,8 @@ def _gain(group: Group, pred: Prediction, channel: str, joint: int) -> np.ndarra
         return plane.output_per_load[:, :, pred.structure.driven[joint]]
     if channel == "position":
         return plane.output_per_position[:, :, joint]
-    unit = np.eye(group.outputs.shape[-1], dtype=complex)[joint]
-    return np.broadcast_to(unit, (len(group.omega), len(unit)))
+    lines, outputs, _ = plane.output_per_motor.shape
+    return np.broadcast_to(np.eye(outputs, dtype=complex)[joint], (lines, outputs))
 
 
 def wave_numbers(problem: Problem, predictions: Sequence[Prediction], joint: int) -> tuple[float, ...]:

@@ -207,13 +207,15 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
         S = output_covariance(problem, group, pred)
         k = np.arange(S.shape[1])
         S[0] *= 4.0
-        power = np.mean(np.abs(_signals(group, pred)[:, : group.n_compared]) ** 2, axis=0)
+        links = k[problem.structure.n :]
+        if rho > 0 or len(links):
+            power = np.mean(np.abs(_signals(group, pred)[:, : group.n_compared]) ** 2, axis=0)
         if rho > 0:
             S[:, k, k] += rho**2 * power
             S[1:, k, k] += 1e-2 * rho**2 * power[1:].mean(axis=0)
-        links = k[problem.structure.n :]
-        left = np.mean(np.abs(output_error(group, pred)[:, 1:, links]) ** 2, axis=(0, 1)) - S[1:, links, links].real.mean(axis=0)
-        S[:, links, links] += np.clip(left, 0.0, LINK_ERROR**2 * power[1:, links].mean(axis=0))
+        if len(links):
+            left = np.mean(np.abs(output_error(group, pred)[:, 1:, links]) ** 2, axis=(0, 1)) - S[1:, links, links].real.mean(axis=0)
+            S[:, links, links] += np.clip(left, 0.0, LINK_ERROR**2 * power[1:, links].mean(axis=0))
         root = np.linalg.inv(np.linalg.cholesky(S)) * np.sqrt(2.0)
         root[0] /= np.sqrt(2.0)
         whiten.append(root)
@@ -223,11 +225,11 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
 
 def _signals(group: Group, prediction: Prediction) -> np.ndarray:
     """(S, L, n + M) what errors of a model are relative to: the torque, and the wind-up of the gears that link encoders show."""
-    signals = group.outputs.copy()
-    windup = signals[..., group.U.shape[-1] :]
-    windup -= (group.Q @ prediction.par.coupling.T)[..., list(group.links)]
+    if not group.links:
+        return group.U
+    windup = group.Q_link[..., list(group.links)] - group.Q @ prediction.par.coupling[list(group.links)].T
     windup[:, 0] = 0.0
-    return signals
+    return np.concatenate([group.U, windup], axis=-1)
 
 
 def residual(group: Group, prediction: Prediction) -> np.ndarray:

@@ -170,7 +170,7 @@ def test_signals_summed_line_by_line_are_those_of_whole_torques(identified, chan
     X, M = (rng.normal(size=shape) + 1j * rng.normal(size=shape) for _ in range(2))
     parts = [(channel, X), ("motor", M)]
     quick = _line_sums([(_Field.build(stage, 0, c, 3), x[:, : group.n_compared]) for c, x in parts])
-    whole = _whole_sums(stage, 0, sum(_gain(stage.problem.groups[0], pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts))
+    whole = _whole_sums(stage, 0, sum(_gain(pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts))
     for name in ("own", "residual", "columns"):
         a, b = getattr(quick, name), getattr(whole, name)
         assert np.abs(a - b).max() < 1e-10 * np.abs(b).max()
