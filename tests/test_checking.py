@@ -228,9 +228,9 @@ def test_a_log_too_short_to_tell_causes_apart_is_said_to_be(arm, log):
 def test_lost_motion_of_a_gear_is_no_skew_of_the_channels():
     """Friction that follows the motion late, by a twentieth of the stroke at each turn."""
     false = 0
-    for name, seeds in (("emps", (0, 1, 2, 3)), ("ur10_bare", (2,)), ("panda_bare", (3,))):
+    for name in ("emps", "ur10_bare", "panda_bare"):
         robot = load_robot(name)
-        for seed in seeds:
+        for seed in range(4):
             s = recording(robot, np.random.default_rng(seed))
             width, z = 0.05 * np.ptp(s.q, axis=0), np.zeros(robot.n)
             followed = [z := np.clip(z + step / width, -1, 1) for step in np.diff(s.q, axis=0, prepend=s.q[:1])]
