@@ -153,10 +153,14 @@ LABELS = {
 def evidence_plot(
     problem: Problem, fit: Fit, predictions: Sequence[Prediction], effect: Effect, cause: int
 ) -> EvidencePlot:
-    """Residual torque without one effect, the ``cause`` of that number, against the variable that explains it, and with it."""
+    """Residual torque without one effect, the ``cause`` of that number, against the variable that explains it, and with it.
+
+    Of a gear whose link encoder is compared, what that shows beside the model: its torque hardly does.
+    """
     h = effect.hypothesis
     rest = Model(fit.model.structure, fit.model.par, tuple(e for e in fit.model.effects if e is not effect))
-    j = max(h.joint, 0)
+    j, n = max(h.joint, 0), problem.structure.n
+    by_link = h.channel == "spring" and all(j in group.links for group in problem.groups)
     xs, ys, ms = [], [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
         without = predict(rest, group, problem.sampling)
@@ -166,8 +170,9 @@ def evidence_plot(
         motion = pred.motion(group)
         band = slice(group.n_compared, None)
         curves = []
-        for X in (group.U - without.U, pred.U - without.U):
-            X = X[..., j : j + 1].copy()
+        row = n + group.links.index(j) if by_link else j
+        for outputs in (group.outputs, pred.outputs(group)):
+            X = (outputs - without.outputs(group))[..., row : row + 1]
             X[:, band] = 0.0
             curves.append(group.to_time(X)[..., 0])
         variable = {
@@ -179,6 +184,8 @@ def evidence_plot(
         }.get(h.variable, lambda c=curves: c[1])()
         # A motion is closed by a return that nobody recorded.
         recorded = slice(None) if group.window is None else group.window > 0.5
+        if by_link:  # the zero of the encoder is not known
+            curves[0] += (curves[1] - curves[0])[:, recorded].mean(axis=1, keepdims=True)
         step = max(1, variable.size // (1500 // max(len(problem.groups), 1) + 1))
         for store, signal in ((xs, variable), (ys, curves[0]), (ms, curves[1])):
             store.append(signal[:, recorded].ravel()[::step])
@@ -188,7 +195,8 @@ def evidence_plot(
     if h.variable in ("posture", "frequency"):
         label = "torque of the fitted effect, N m"
     joint = problem.structure.robot.joint_names[j]
-    return EvidencePlot(cause, f"{h.effect.replace('_', ' ')} at {h.place}", label, f"residual torque of {joint}, N m", x, y, x[order], m[order])
+    shown = f"link encoder of {joint} beside the model, rad" if by_link else f"residual torque of {joint}, N m"
+    return EvidencePlot(cause, f"{h.effect.replace('_', ' ')} at {h.place}", label, shown, x, y, x[order], m[order])
 
 
 def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> str:

@@ -150,7 +150,7 @@ class SpectrumMap:
 
 @dataclass(frozen=True)
 class EvidencePlot:
-    """Residual torque against the variable that explains it, and the fitted law."""
+    """Residual torque, or that of a link encoder, against the variable that explains it, and the fitted law."""
 
     cause: int
     title: str

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnose import diagnose, set_up
+from ident.diagnose import diagnose, diagnose_fully, set_up
+from ident.extended import Model
 from ident.link_sensor import LinkDelay, comparable_links, with_link_encoders
-from ident.torque_fit import Model, data_count, data_counts, jacobian, pack, predictions, unpack
+from ident.torque_fit import data_count, data_counts, jacobian, pack, predictions, unpack
 from sim import run_experiment
 from sim.effects import parse_effect
 from sim.experiment import draw_drives
@@ -43,9 +44,13 @@ def still(ur10, tmp_path_factory):
 )
 def test_a_law_of_the_gear_is_named_by_link_encoders(ur10, tmp_path, text, figure, value):
     data = motions(ur10, 21, [parse_effect(text, ur10)], tmp_path)
-    (cause,) = [c for c in diagnose(data).causes if c.probability > 0.5]
+    done = diagnose_fully(data)
+    (cause,) = [c for c in done.verdict.causes if c.probability > 0.5]
     assert f"{cause.effect}@{cause.joint}" == text.split(":")[0] and cause.probability > 0.8
     assert cause.parameters[figure].value == pytest.approx(value, rel=0.02)
+    plot = done.evidence[done.verdict.causes.index(cause)]
+    left = plot.y[np.argsort(plot.x)] - plot.model_y
+    assert "link encoder" in plot.y_label and np.std(left) < 0.2 * np.std(plot.model_y)
 
 
 def test_link_encoders_with_nothing_hidden_bring_no_cause(still):
