@@ -236,7 +236,7 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
         i = index[f"{h.effect}@{h.place}:{q.name}"]
         s = float(np.sqrt(max(covariance[i, i], 0.0)))
         std[q.name] = s * abs(v) if q.log else s
-        if not q.nuisance:
+        if q.reported or not q.nuisance:
             out[q.name] = Value(float(v), std[q.name], q.unit)
     if "sine" in out:
         a, b = out.pop("sine"), out.pop("cosine")

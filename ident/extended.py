@@ -30,6 +30,7 @@ from ident.records import NOISE_LINES, POINTS_PER_LINE, Group, mean_over_lines
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of periodic data, at least
 LOOP_MOST = 6  # the same, at most: modes far above the signals follow at once
+RECORD_AGREED = 1e-5  # step over the deflection that ends them
 RECORD_STEPS = 20  # towards the deflection that agrees with a record
 NOISE_DRAWS = 4  # of the noise that a gear along its record answers to
 LEAST_GAIN = 1e-3  # of a gear, torque at the motor per torque in parallel with its spring, that noise is divided by
@@ -361,7 +362,7 @@ def simulated_laws(model: Model) -> Model:
 
 
 def _along_record(
-    law: tuple[int, float, float, float],
+    law: kernels.Law,
     par: Parameters,
     plane: Plane,
     group: Group,
@@ -397,13 +398,16 @@ def _along_record(
         along = kernels.along_deflection(*law, group.to_time(x[..., None])[..., 0], mean, bisections)
         return group.to_lines(along[..., None])[..., 0]
 
-    slope = kernels.largest_slope(*law, float(np.abs(group.to_time(known[..., None])).max()))
+    slope = kernels.largest_slope(law, float(np.abs(group.to_time(known[..., None])).max()))
     trust = np.ones(len(gain))  # of the law's measurement, against that through the link
     trust[1:] = np.abs(link * slope) ** 2 / (1.0 + np.abs(link * slope) ** 2)
     x = known
     for _ in range(RECORD_STEPS):
         miss = carried - plane.C[:, j] * x - torque_at(x, 0)
-        x = x + (1.0 - trust) * (known - x) + trust * miss / slope
+        step = (1.0 - trust) * (known - x) + trust * miss / slope
+        x = x + step
+        if np.linalg.norm(step) <= RECORD_AGREED * np.linalg.norm(x):
+            break
     torque = torque_at(x, RECORD_BISECTIONS)
     said = torque.copy()
     said[:, 1:] = (carried - plane.C[:, j] * known)[:, 1:]
@@ -429,7 +433,7 @@ def _modes(
 
 
 def _loop(
-    law: tuple[int, float, float, float], grid: Group, free: np.ndarray, modes: np.ndarray, guess: np.ndarray
+    law: kernels.Law, grid: Group, free: np.ndarray, modes: np.ndarray, guess: np.ndarray
 ) -> np.ndarray:
     """Spectrum (S, L) of the torque of a law in steady state with the arm.
 
@@ -437,7 +441,7 @@ def _loop(
         free: (S, L) where the arm would be without; guess: (S, L) torque to begin with.
     """
     x = grid.to_time(free[..., None])[..., 0]
-    rate = grid.to_time((1j * grid.omega * free)[..., None])[..., 0] if law[0] == kernels.LINK else x
+    rate = grid.to_time((1j * grid.omega * free)[..., None])[..., 0] if law.code == kernels.LINK else x
     start = modal_state(guess, grid.omega, grid.period_time / grid.n_time, modes)
     return grid.to_lines(steady_loop(law, x, rate, modes, start)[..., None])[..., 0]
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ident.hypotheses.kernels import bristle, elastoplastic
+from ident.hypotheses.yielding import along_path, bristle, elastoplastic
 from ident.show.export import build_mjcf
 from robot_assets.robot import load_robot
 from tests.test_show import cause, parameters
@@ -91,6 +91,26 @@ def test_hysteresis_is_maxwell_slip(bench):
     # The state is set, so that a step that MuJoCo takes before the next one is not part of the path.
     half = len(q) // 2
     assert np.abs(got + law)[half:].max() < 0.02 * 0.2
+
+
+@pytest.mark.parametrize(("exponent", "recoil"), [(1.0, 0.0), (2.0, 0.5), (8.0, 0.0)])
+def test_hysteresis_that_yields_gradually_is_slips_near_to_it(bench, exponent, recoil):
+    """Nearer than one slip of the same stiffness and torque, along swings far into yielding."""
+    model, data = exported(bench, cause("hysteresis", JOINT, stiffness=80.0, yield_torque=0.2, exponent=exponent, recoil=recoil))
+    _, q, v = swing(model, 0.01, 2.0)
+    steps = (q - np.roll(q, 1))[None]
+    law = along_path(steps, 80.0, 0.2, exponent, recoil)[0]
+    half = len(q) // 2
+    off, of_one = (np.std((x - law)[half:]) for x in (-forced(model, data, q, v), elastoplastic(q[None], 80.0, 0.2)[0]))
+    assert off < of_one and off < 0.12 * np.std(law)
+
+
+def test_sharp_presliding_friction_is_slips(bench):
+    model, data = exported(bench, cause("presliding_friction", JOINT, stiffness=100.0, coulomb=0.3, exponent=50.0))
+    _, q, v = swing(model, 0.02, 2.0)
+    law = elastoplastic(q[None], 100.0, 0.3)[0]
+    half = len(q) // 2
+    assert np.abs(forced(model, data, q, v) + law)[half:].max() < 0.02 * 0.3
 
 
 @pytest.mark.parametrize("delay", [1e-4, 4e-4, 1.07e-3])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
-from ident.hypotheses.kernels import bristle, smooth_sign
+from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen
+from ident.hypotheses.kernels import smooth_sign
+from ident.hypotheses.yielding import DAHL, bristle
 from ident.inverse import Motion
 
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
@@ -123,19 +126,17 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "special": lambda p: np.array([p[0], 0.0, p[3]]),
             "dry": True,
             "trivial": lambda p: p[1] < 1.15 * p[0],
+            "widens": lambda p, s: [np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2]]) for f in (0.05, 0.3)],
         },
     )
 
 
 def presliding_friction(joint: int, place: str) -> Hypothesis:
-    """Dahl bristle: spring of ``stiffness`` before it slips at ``coulomb`` (Dahl 1968)."""
-
-    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        return p[1] * bristle(motion.v(j), motion.time_step, p[1] / p[0])
+    """Spring of ``stiffness`` before it slips at ``coulomb``: Dahl's bristle, or a sharper one (see ``yielding``)."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         z = bristle(motion.v(j), motion.time_step, shape[0])
-        return Screen((z,), lambda c: np.array([c[0] / shape[0], c[0]]) if c[0] > 0 else None, shape)
+        return Screen((z,), lambda c: np.array([c[0] / shape[0], c[0], DAHL]) if c[0] > 0 else None, shape)
 
     return Hypothesis(
         "presliding_friction",
@@ -145,8 +146,9 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
         (
             Parameter("stiffness", "N m/rad", 1e-6, 1e12, log=True, step=1e-2),
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
+            replace(EXPONENT, center=DAHL, null=DAHL),
         ),
-        law,
+        lambda p, motion, j, k: p[1] * bristle(motion.v(j), motion.time_step, p[1] / p[0], p[2]),
         lambda scale: [(f * max(scale.q, LEAST_MOTION),) for f in (0.01, 0.03, 0.1, 0.3, 1.0)],
         screen,
         "The residual torque of {joint} makes loops in position: friction that yields as a spring of"
@@ -154,10 +156,11 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
         variable="q",
         options={
             "absorbs": "coulomb_friction",
-            "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0]]),
+            "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0], p[2]]),
             "apart": "stiffness",
             "give": lambda p: p[1] / p[0],
             "special": lambda p: np.array([p[1], 0.0, SHARP]),
+            "widens": lambda p, s: [np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL]) for f in (0.02, 0.2)],
         },
     )
 

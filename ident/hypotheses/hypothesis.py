@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ident.hypotheses.yielding import SLIP
 from ident.inverse import Motion
 
 LOG_SPREAD = 1.5  # of a positive parameter before the data, natural logarithm
@@ -21,7 +22,7 @@ class Parameter:
         name, unit: as in the catalogue.
         lower, upper: physical bounds.
         log: fitted as a logarithm (positive parameters that span decades).
-        nuisance: fitted but not reported.
+        nuisance: fitted but no parameter of the catalogue; reported all the same where ``reported`` says so.
         step: finite-difference step in fitted coordinates.
         center, spread: a weak prior, external units, the spread in fitted coordinates; none where infinite.
         per_stiffness: ``center`` is in units of the stiffness of the joint's gear.
@@ -39,6 +40,7 @@ class Parameter:
     spread: float = np.inf
     per_stiffness: bool = False
     null: float | None = None
+    reported: bool = False
 
     def prior_center(self, stiffness: float) -> float:
         """Centre of the weak prior in fitted coordinates, 0 where there is none."""
@@ -68,6 +70,9 @@ class Parameter:
         if self.upper - self.lower <= UNIT_RANGE:
             return (self.upper - self.lower) / np.sqrt(12.0)
         return max(abs(value), 1e-300)
+
+
+EXPONENT = Parameter("exponent", "1", 0.5, SLIP, True, nuisance=True, step=0.05, center=1.0, spread=1.5, reported=True)
 
 
 @dataclass(frozen=True)
@@ -108,7 +113,7 @@ class Hypothesis:
         options: what single hypotheses need beyond that. ``size(scale)`` gives parameters of a strong effect
             to start from where no linear step leads there. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
-            place of one with parameters ``old`` at the same joint. ``apart``: the parameter that sets it apart from that
+            place of one with parameters ``old`` at the same joint, ``widens(old, scale)`` starts to try of other shapes. ``apart``: the parameter that sets it apart from that
             special case, and ``special(p)`` the parameters of the special case that it is where the data do not show this
             one, or where ``give(p)``, rad, is less than the noise of the position. ``essential`` names the parameter without
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm

@@ -6,12 +6,34 @@ again until it repeats (friction elements forget in one).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+
+from ident.hypotheses.yielding import SLIP, yielded, yielding_point
 
 TURNED = 19.1  # argument beyond which tanh is one in double precision
 VECTORS = {"contract", "reassoc", "nsz"}  # what lets the compiler step several records at once
 CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK, CABLE = 0, 1, 2, 3, 4, 5
+
+
+class Law(NamedTuple):
+    """A law of the gear, or of a cable on a link.
+
+    Attributes:
+        code: which; a, b: its parameters. ``HYSTERESIS`` yields at ``b`` after a stiffness ``a``; ``LINK`` is
+            ``a x + b tanh(x' / k)`` on a link; ``CABLE`` is ``a x`` and a spring ``k`` that yields at ``b`` there.
+        k: linear stiffness of the gear, N m/rad.
+        exponent, recoil: of an element that yields (see ``yielding``); a Maxwell slip where nothing is said.
+    """
+
+    code: int
+    a: float
+    b: float
+    k: float
+    exponent: float = SLIP
+    recoil: float = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -34,44 +56,9 @@ def smooth_sign(v: np.ndarray, smoothing: float) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def bristle(v: np.ndarray, dt: float, length: float) -> np.ndarray:
-    """Dahl bristle of unit Coulomb torque along velocity ``v`` (S, T).
-
-    ``z' = v / length - |v| / length z``: exact over steps of constant velocity (Dahl 1968).
-
-    Args:
-        length: breakaway distance, Coulomb torque over bristle stiffness, rad.
-    """
-    S, T = v.shape
-    out = np.empty((S, T))
-    for i in range(S):
-        z = 0.0
-        for _ in range(2):
-            for k in range(T):
-                path = 0.5 * (v[i, k] + v[i, k - 1]) * dt / length
-                decay = np.exp(-abs(path))
-                z = z * decay + (1.0 - decay) * (1.0 if path > 0 else -1.0)
-                out[i, k] = z
-    return out
-
-
-@njit(cache=True, nogil=True)
-def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
-    """Maxwell slip element: torque of a spring that yields, along deflection ``x`` (S, T)."""
-    S, T = x.shape
-    out = np.empty((S, T))
-    for i in range(S):
-        h = 0.0
-        for _ in range(2):
-            for k in range(T):
-                h = h + stiffness * (x[i, k] - x[i, k - 1])
-                h = min(max(h, -limit), limit)
-                out[i, k] = h
-    return out
-
-
-@njit(cache=True, nogil=True)
-def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: float, h_old: float) -> float:
+def spring_torque(
+    code: int, a: float, b: float, k: float, exponent: float, recoil: float, x: float, x_old: float, h_old: float
+) -> float:
     """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``; or of a ``CABLE``, see ``loop_sweep``, on a link."""
     if code == 5:
         return a * x + min(max(h_old - a * x_old + k * (x - x_old), -b), b)
@@ -90,7 +77,7 @@ def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: floa
         if x < -b:
             return -(a - k) * b
         return (a - k) * x
-    return min(max(h_old + a * (x - x_old), -b), b)
+    return yielded(a, b, exponent, recoil, h_old, x - x_old)[0]
 
 
 @njit(cache=True, nogil=True)
@@ -133,43 +120,68 @@ def spring_point(
     return x
 
 
-def largest_slope(code: int, a: float, b: float, k: float, reach: float) -> float:
+def largest_slope(law: Law, reach: float) -> float:
     """Largest stiffness of a nonlinear gear within a deflection ``reach``, N m/rad."""
-    return {CUBIC: k + 3.0 * a * reach**2, HYSTERESIS: k + a}.get(code, k)
+    if law.code == CUBIC:
+        return law.k + 3.0 * law.a * reach**2
+    return law.k + law.a * (1.0 + max(law.recoil, 0.0)) if law.code == HYSTERESIS else law.k
 
 
 @njit(cache=True, nogil=True)
 def along_deflection(
-    code: int, a: float, b: float, k: float, x: np.ndarray, mean: np.ndarray, bisections: int
+    code: int,
+    a: float,
+    b: float,
+    k: float,
+    exponent: float,
+    recoil: float,
+    x: np.ndarray,
+    mean: np.ndarray,
+    bisections: int,
 ) -> np.ndarray:
     """Torque beyond ``k x`` of a nonlinear gear along a deflection, moved to where the gear carries a mean torque; (S, T).
 
-    Within a dead band that holds all of the motion many places carry none.
+    What yields does not see where it is, only how it moves. Within a dead band that holds all of the motion many places
+    carry none: bisection ends at the last of them. Of other laws false position finds the only one (Dowell and Jarratt,
+    BIT 11, 1971).
 
     Args:
-        x: (S, T) rad; mean: (S,) N m of ``k x`` and the law; bisections: 0 leaves ``x`` where it is.
+        x: (S, T) rad; mean: (S,) N m of ``k x`` and the law; bisections: at most; 0 leaves ``x`` where it is.
     """
     S, T = x.shape
     out = np.empty((S, T))
+    if code == 3:
+        for i in range(S):
+            h = 0.0
+            for _ in range(2):
+                for t in range(T):
+                    h = yielded(a, b, exponent, recoil, h, x[i, t] - x[i, t - 1])[0]
+                    out[i, t] = h
+        return out
     least = k if code != 2 else min(a, k)
     for i in range(S):
-        reach = abs(mean[i]) / least + np.abs(x[i]).max() + (a if code == 1 else b / least if code == 3 else b)
-        low, high = -reach, reach
+        reach = abs(mean[i]) / least + np.abs(x[i]).max() + (a if code == 1 else b)
+        low, high, offset = -reach, reach, 0.0
+        last, too_low, too_high = 0, 0.0, 0.0  # misses at both ends, zero as long as one is not known
         for _step in range(bisections + 1):
-            offset, total, h = 0.5 * (low + high), 0.0, 0.0
-            old = x[i, T - 1] + offset
-            for _ in range(2 if code == 3 else 1):
-                total = 0.0
-                for t in range(T):
-                    new = x[i, t] + offset
-                    h = spring_torque(code, a, b, k, new, old, h)
-                    out[i, t] = h
-                    total += k * new + h
-                    old = new
-            if total > mean[i] * T:
-                high = offset
+            total = 0.0
+            for t in range(T):
+                new = x[i, t] + offset
+                out[i, t] = spring_torque(code, a, b, k, exponent, recoil, new, new, 0.0)
+                total += k * new + out[i, t]
+            miss = total / T - mean[i]
+            if code != 1 and abs(miss) <= 1e-11 * k * reach:
+                break
+            side = 1 if miss > 0.0 else -1
+            if side > 0:
+                high, too_high, too_low = offset, miss, too_low * (0.5 if side == last else 1.0)
             else:
-                low = offset
+                low, too_low, too_high = offset, miss, too_high * (0.5 if side == last else 1.0)
+            last = side
+            if code == 1 or too_low == 0.0 or too_high == 0.0:
+                offset = 0.5 * (low + high)
+            else:
+                offset = (low * too_high - high * too_low) / (too_high - too_low)
     return out
 
 
@@ -204,6 +216,8 @@ def loop_sweep(
     a: float,
     b: float,
     k: float,
+    exponent: float,
+    recoil: float,
     linear: np.ndarray,
     rate: np.ndarray,
     modes: np.ndarray,
@@ -214,8 +228,7 @@ def loop_sweep(
     """One period of a law that moves the arm by which it is moved (see ``loop.steady_loop``).
 
     Args:
-        code, a, b, k: law. Of a gear, its two parameters and the linear stiffness, N m/rad; ``LINK``:
-            ``a x + b tanh(x' / k)`` on a link; ``CABLE``: ``a x`` and a spring ``k`` that yields at ``b`` there.
+        code, a, b, k, exponent, recoil: as in ``Law``.
         linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
         modes: (4, modes) complex: poles, decay, gain_old, gain_new.
         start: (modes, S) complex state of the modes one step before the period.
@@ -226,6 +239,7 @@ def loop_sweep(
         (modes, S) state at the end, and (S,) largest change of the torque over the largest torque.
     """
     T, S = linear.shape
+    rounded = code == 3 and exponent < SLIP
     poles, decay, gain_old, gain_new = modes
     # A mode without the share of the torque of this step: that of the next one follows from both in one go.
     gain = decay * gain_new + gain_old
@@ -257,8 +271,12 @@ def loop_sweep(
                 h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
         else:
             for i in range(S):
-                new = spring_point(code, a, b, k, free[i], direct, x[i], past[i], h[i])
-                h[i] = spring_torque(code, a, b, k, new, x[i], h[i])
+                if rounded:
+                    step, h[i] = yielding_point(a, b, exponent, recoil, h[i], free[i] - x[i], direct, x[i] - past[i])
+                    new = x[i] + step
+                else:
+                    new = spring_point(code, a, b, k, free[i], direct, x[i], past[i], h[i])
+                    h[i] = spring_torque(code, a, b, k, exponent, recoil, new, x[i], h[i])
                 past[i] = x[i]
                 x[i] = new
         for m in range(len(decay)):

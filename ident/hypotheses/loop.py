@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.hypotheses.kernels import CABLE, LINK, loop_sweep, spring_torque
+from ident.hypotheses.kernels import CABLE, LINK, Law, loop_sweep, spring_torque
 from ident.mixing import MEMORY, mixed
 
 SWEEPS = 25  # periods at most until the steady state
@@ -12,7 +12,7 @@ STEADY = 1e-5  # change of the torque from one to the next, over the largest, th
 
 
 def steady_loop(
-    law: tuple[int, float, float, float], linear: np.ndarray, rate: np.ndarray, modes: np.ndarray, guess: np.ndarray | None = None
+    law: Law, linear: np.ndarray, rate: np.ndarray, modes: np.ndarray, guess: np.ndarray | None = None
 ) -> np.ndarray:
     """Torque (S, T) of a law in steady state with the arm, N m.
 
@@ -22,12 +22,11 @@ def steady_loop(
     repeats; where a sweep begins is mixed from those before.
 
     Args:
-        law: code, a, b, k (see ``kernels.loop_sweep``).
         linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
         modes: (4, modes) complex, of ``kernels.modal_compliance``.
         guess: (modes, S) complex state from which to begin; rest where None.
     """
-    code, a, b, k = law
+    code, a, b, k = law[:4]
     S, T = linear.shape
     poles, decay, _, _ = modes
     whole = (decay**T)[:, None]
@@ -39,7 +38,7 @@ def steady_loop(
     elif code == CABLE:
         h = a * x
     else:
-        h = np.array([spring_torque(code, a, b, k, v, v, 0.0) for v in x])
+        h = np.array([spring_torque(*law, v, v, 0.0) for v in x])
     memory, left = np.stack([x, x, h]), np.arange(S)
     out, part = np.zeros((T, S)), np.zeros((T, S))
     past: list[tuple[np.ndarray, np.ndarray]] = []

@@ -22,6 +22,7 @@ from ident.graybox import (
 from ident.hypotheses import kernels
 from ident.hypotheses.friction import SMOOTHING, direction
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.hypotheses.yielding import elastoplastic
 from ident.inverse import (
     Motion,
     Plane,
@@ -140,7 +141,7 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
 
         if not yields:
             return Screen((q, direction(v, turn)), start)
-        return Screen((q, kernels.elastoplastic(q, 1.0 / max(give, 1e-12), 1.0)), start)
+        return Screen((q, elastoplastic(q, 1.0 / max(give, 1e-12), 1.0)), start)
 
     return Hypothesis(
         "dress_pack",
@@ -158,7 +159,7 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
         options={
-            "loop": lambda p: (kernels.CABLE, p[0], p[1], p[1] / p[2]) if yields else (kernels.LINK, p[0], p[1], p[2]),
+            "loop": lambda p: kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2]) if yields else kernels.Law(kernels.LINK, p[0], p[1], p[2]),
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the motor.
             "trivial": lambda p: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",

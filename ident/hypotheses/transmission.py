@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ident.hypotheses import kernels
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen
+from ident.hypotheses.yielding import elastoplastic
 from ident.inverse import Motion
 
+ROUNDED = 5.0  # exponent of a hysteresis before the data
 SOFTEST = 0.05  # share of its stiffness that a soft middle keeps at least: with less it is a dead band
-
-
-def _static(code: int, a: float, b: float, k: float, x: np.ndarray) -> np.ndarray:
-    if code == kernels.CUBIC:
-        return a * x**3
-    if code == kernels.BACKLASH:
-        return -k * np.clip(x, -0.5 * a, 0.5 * a)
-    if code == kernels.SOFTENING:
-        return (a - k) * np.clip(x, -b, b)
-    return kernels.elastoplastic(x, a, b)
 
 
 def hardening_stiffness(joint: int, place: str) -> Hypothesis:
@@ -33,7 +27,7 @@ def hardening_stiffness(joint: int, place: str) -> Hypothesis:
         joint,
         "spring",
         (Parameter("cubic", "N m/rad3", 1e-3, 1e20, log=True, step=1e-2),),
-        lambda p, delta, k: (kernels.CUBIC, p[0], 0.0, k),
+        lambda p, delta, k: kernels.Law(kernels.CUBIC, p[0], 0.0, k),
         lambda scale: [()],
         screen,
         "The gear of {joint} stiffens with its deflection (cubic term {cubic:.3g} N m/rad3): the resonance"
@@ -47,7 +41,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
     """Dead band of width ``gap`` in the gear's deflection."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        signal = _static(kernels.BACKLASH, shape[0], 0.0, k, motion.delta(j))
+        signal = -k * np.clip(motion.delta(j), -0.5 * shape[0], 0.5 * shape[0])
         return Screen(
             (signal,), lambda c: np.array([shape[0] * np.clip(c[0], 0.3, 3.0)]) if c[0] > 0.1 else None, shape
         )
@@ -58,7 +52,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
         joint,
         "spring",
         (Parameter("gap", "rad", 1e-9, 0.5, log=True, step=1e-2),),
-        lambda p, delta, k: (kernels.BACKLASH, p[0], 0.0, k),
+        lambda p, delta, k: kernels.Law(kernels.BACKLASH, p[0], 0.0, k),
         lambda scale: [(2 * f * scale.delta[2],) for f in (0.03, 0.1, 0.3, 1.0)],
         screen,
         "The gear of {joint} has a dead band of {gap:.3g} rad: its resonance drops at small amplitude wherever"
@@ -88,7 +82,7 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
             Parameter("low_stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=0.8, per_stiffness=True),
             Parameter("transition", "rad", 1e-9, 1.0, log=True, step=1e-2),
         ),
-        lambda p, delta, k: (kernels.SOFTENING, float(np.clip(p[0], SOFTEST * k, k)), p[1], k),
+        lambda p, delta, k: kernels.Law(kernels.SOFTENING, float(np.clip(p[0], SOFTEST * k, k)), p[1], k),
         lambda scale: [(f * scale.delta[2],) for f in (0.1, 0.3, 0.7, 1.5)],
         screen,
         "The gear of {joint} is soft about zero torque ({low_stiffness:.3g} N m/rad within"
@@ -99,12 +93,12 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
 
 
 def hysteresis(joint: int, place: str) -> Hypothesis:
-    """Elastoplastic element beside the gear's spring (Maxwell slip)."""
+    """Element that yields beside the gear's spring: from a Bouc-Wen one to a Maxwell slip (see ``yielding``)."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        unit = kernels.elastoplastic(motion.delta(j), 1.0, shape[0])
+        unit = elastoplastic(motion.delta(j), 1.0, shape[0])
         return Screen(
-            (unit,), lambda c: np.array([c[0], c[0] * shape[0]]) if c[0] > 0 else None, shape
+            (unit,), lambda c: np.array([c[0], c[0] * shape[0], ROUNDED, 0.0]) if c[0] > 0 else None, shape
         )
 
     return Hypothesis(
@@ -115,14 +109,16 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
         (
             Parameter("stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=1.5, per_stiffness=True),
             Parameter("yield_torque", "N m", 1e-9, 1e7, log=True, step=1e-2),
+            replace(EXPONENT, center=ROUNDED),
+            Parameter("recoil", "1", 0.0, 1.5, nuisance=True, step=0.05, center=0.0, spread=0.5, null=0.0, reported=True),
         ),
-        lambda p, delta, k: (kernels.HYSTERESIS, p[0], p[1], k),
+        lambda p, delta, k: kernels.Law(kernels.HYSTERESIS, p[0], p[1], k, p[2], p[3]),
         lambda scale: [(f * scale.delta[1],) for f in (0.03, 0.1, 0.3, 1.0)],
         screen,
         "The torque of {joint} makes loops against the gear's deflection: an element of {stiffness:.3g} N m/rad"
         " that yields at {yield_torque:.3g} N m.",
         variable="delta",
-        options={"size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms])},
+        options={"size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms, ROUNDED, 0.0])},
     )
 
 

@@ -12,7 +12,9 @@ import pinocchio as pin
 import tomlkit
 
 from ident.graybox import LinkChange, build_structure, parameter_unit
+from ident.hypotheses.yielding import DAHL, SLIP
 from ident.show.figures import unit_suffix
+from ident.show.slips import maxwell_slips
 from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
 
@@ -22,6 +24,8 @@ MOST_REFINED = 10  # at most this many times finer where a delay or a lag is sho
 BRISTLE = 0.7  # frequency of a bristle that stands for a sign, over the step rate, rad
 TIGHT = [0.999, 0.999, 0.001, 0.5, 2.0]  # impedance of dry friction: hardly any creep
 NO_INPUT = int(mujoco.mjtCtrlInput.mjINPUT_NONE)
+MOST_ROUNDED = 2.0  # exponent of a presliding friction below which it is the bristle that MuJoCo has
+FRICTION_SLIP = "friction"
 PASSIVE_GROUP = 1  # of actuators without input
 TORQUE_OFFSET = "torque_offset"
 ROTOR_MASS = 1e-3  # kg, of a sphere of 50 mm: a body must have a mass; its inertia is taken off the armature
@@ -115,10 +119,9 @@ def build_mjcf(
         if cause.joint in robot.joint_names:
             _add_effect(spec, i, cause)
     for (source, target), ratio in _couplings(robot, causes).items():
-        slips = [f"slip:{i}" for i, c in enumerate(causes) if c.effect == "hysteresis" and c.joint == target]
-        for name in (f"gear:{target}", f"outer:{target}", *slips):
-            tendon = spec.tendon(name)
-            if tendon is not None:
+        slips = [f"slip:{i}." for i, c in enumerate(causes) if c.effect == "hysteresis" and c.joint == target]
+        for tendon in spec.tendons:
+            if tendon.name in (f"gear:{target}", f"outer:{target}") or tendon.name.startswith(tuple(slips)):
                 tendon.wrap_joint(f"motor:{source}", ratio)
     return spec
 
@@ -208,7 +211,7 @@ def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> 
 NATIVE = {
     "coulomb_friction": "frictionloss of motor:{place} and, where it is asymmetric, passive:{index}",
     "stribeck_friction": "bristle of passive:{index}, as stiff as the time step allows, for the turn of the sign",
-    "presliding_friction": "bristle of passive:{index}",
+    "presliding_friction": "bristle of passive:{index}, or springs friction:{index} which yield",
     "cogging": "cogging of passive:{index}",
     "torque_constant": "gear of drive:{place}",
     "torque_lag": "first-order filter of drive:{place}",
@@ -217,7 +220,7 @@ NATIVE = {
     "hardening_stiffness": "cubic stiffness of gear:{place}",
     "softening_stiffness": "gear:{place} and, with a dead band, outer:{place}",
     "backlash": "springlength of gear:{place}",
-    "hysteresis": "spring of slip:{index}, which yields",
+    "hysteresis": "springs slip:{index}, which yield",
     "gravity_spring": "spring of link:{place}",
     "dress_pack": "spring and frictionloss of link:{place}",
     "joint_coupling": "motor:{place} in the gear of the next joint",
@@ -309,7 +312,11 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         static = max(p["static"], p["coulomb"])
         _add_passive(spec, index, name, lugre=[stiffness, 0.0, p["coulomb"], static, p["stribeck_velocity"]])
     elif cause.effect == "presliding_friction":
-        _add_passive(spec, index, name, lugre=[p["stiffness"], 0.0, p["coulomb"], p["coulomb"], 1.0])
+        if p.get("exponent", DAHL) < MOST_ROUNDED:
+            _add_passive(spec, index, name, lugre=[p["stiffness"], 0.0, p["coulomb"], p["coulomb"], 1.0])
+        else:
+            slips = maxwell_slips(p["stiffness"], p["coulomb"], p["exponent"], 1.0)
+            _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"motor:{name}": 1.0})
     elif cause.effect == "cogging":
         _add_passive(spec, index, name, cogging=[-p["amplitude"], p["periods_per_rev"], p.get("phase", 0.0)])
     elif cause.effect == "torque_constant":
@@ -335,8 +342,8 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         gear.stiffness = [low, 0, gear.stiffness[2]]
         _add_parallel(spec, f"outer:{name}", name, k - low, p["transition"])
     elif cause.effect == "hysteresis":
-        slip = _add_parallel(spec, f"slip:{index}", name, p["stiffness"], 0.0)
-        slip.springyield = p["yield_torque"] / p["stiffness"]
+        slips = maxwell_slips(p["stiffness"], p["yield_torque"], p.get("exponent", SLIP), p.get("recoil", 0.0))
+        _add_slips(spec, f"slip:{index}", slips, {f"motor:{name}": 1.0, f"link:{name}": -1.0})
     elif cause.effect in ("gravity_spring", "dress_pack"):
         _add_spring(link, p["stiffness"], p.get("rest_angle", 0.0))
         if p.get("friction", 0.0) > 0:
@@ -372,6 +379,15 @@ def _add_parallel(spec: mujoco.MjSpec, name: str, joint: str, stiffness: float, 
     spring.wrap_joint(f"link:{joint}", -1.0)
     spring.stiffness, spring.springlength = [stiffness, 0, 0], [-free, free]
     return spring
+
+
+def _add_slips(spec: mujoco.MjSpec, name: str, slips: Sequence[tuple[float, float]], along: dict[str, float]) -> None:
+    """Springs that yield, each of a stiffness (N m/rad) up to a torque (N m), along a sum of joints."""
+    for i, (stiffness, limit) in enumerate(slips):
+        slip = spec.add_tendon(name=f"{name}.{i}")
+        for joint, share in along.items():
+            slip.wrap_joint(joint, share)
+        slip.stiffness, slip.springlength, slip.springyield = [stiffness, 0, 0], [0, 0], limit / stiffness
 
 
 def _add_spring(joint: mujoco.MjsJoint, stiffness: float, rest: float) -> None:

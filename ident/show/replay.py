@@ -26,7 +26,7 @@ from mujoco.batch import Batch
 from ident.graybox import hold_response
 from ident.inverse import Sampling
 from ident.records import Group
-from ident.show.export import PASSIVE_GROUP, TORQUE_OFFSET, stage_lead
+from ident.show.export import FRICTION_SLIP, PASSIVE_GROUP, TORQUE_OFFSET, stage_lead
 
 LOOP = 0.15  # frequency of the loop times the time by which torque lags what the loop sees, rad
 PERIODS = 6  # at most, after the one in which the motion fades in
@@ -261,6 +261,8 @@ def _smooth(arm: Arm) -> mujoco.MjModel:
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
     model.opt.disableactuator |= 1 << PASSIVE_GROUP
     model.actuator_delay[:] = 0.0
+    slips = [i for i in range(model.ntendon) if model.tendon(i).name.startswith(f"{FRICTION_SLIP}:")]
+    model.tendon_stiffness[slips] = 0.0
     return model
 
 

@@ -1,0 +1,104 @@
+"""Elements that yield: a spring up to a limit, and how it gets there.
+
+The torque ``h`` along a path ``x`` follows ``h' = k (1 - w^n) x'`` where the path drives it on and ``h' = k (1 + r w^n) x'``
+where it leads it back, ``w = |h| / limit``: a Bouc-Wen element (Wen, J. Eng. Mech. Div. ASCE 102, 1976, with
+``beta + gamma = 1``, ``beta - gamma = r >= 0``). It holds Dahl's bristle (``n = 1``, ``r = 1``; Dahl 1968) and, where ``n`` is
+large, the Maxwell slip; several slips of different limits in parallel are close to one of some ``n`` between.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+DAHL = 1.0  # exponent of Dahl's bristle
+SLIP = 50.0  # exponent from which on the element is a Maxwell slip
+SHORT = 1e-4  # of the deflection at which an element yields: a step whose square is nothing
+
+
+def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
+    """Maxwell slip element: torque of a spring that yields, along one period of a deflection ``x`` (S, T)."""
+    return along_path(x - np.roll(x, 1, axis=1), stiffness, limit, SLIP, 0.0)
+
+
+def bristle(v: np.ndarray, dt: float, length: float, exponent: float = DAHL) -> np.ndarray:
+    """Torque of a bristle of unit Coulomb torque along one period of a velocity ``v`` (S, T), rad/s.
+
+    Args:
+        dt: s; length: breakaway distance, Coulomb torque over bristle stiffness, rad.
+        exponent: Dahl's where nothing is said: exact then over steps of constant velocity.
+    """
+    return along_path(0.5 * dt * (v + np.roll(v, 1, axis=1)), 1.0 / length, 1.0, exponent, 1.0)
+
+
+@njit(cache=True, nogil=True)
+def along_path(steps: np.ndarray, stiffness: float, limit: float, exponent: float, recoil: float) -> np.ndarray:
+    """Torque of an element that yields along the steps (S, T) of one period, after one period before it."""
+    S, T = steps.shape
+    out = np.empty((S, T))
+    for i in range(S):
+        h = 0.0
+        for _ in range(2):
+            for t in range(T):
+                h, _slope = yielded(stiffness, limit, exponent, recoil, h, steps[i, t])
+                out[i, t] = h
+    return out
+
+
+@njit(cache=True, nogil=True)
+def yielded(k: float, limit: float, n: float, recoil: float, h: float, dx: float) -> tuple[float, float]:
+    """Torque after a step ``dx`` from a torque ``h``, and its slope there.
+
+    By exponential steps, the law being linearised where each begins (Rosenbrock-Euler): of second order, stable for any
+    ``dx``, and exact for Dahl's bristle.
+    """
+    if n >= SLIP:
+        new = h + k * dx
+        if abs(new) > limit:
+            return (limit if new > 0 else -limit), 0.0
+        return new, k
+    sign = 1.0 if dx > 0 else -1.0
+    path, w = k * abs(dx) / limit, sign * h / limit
+    if w < 0.0:
+        back = recoil * (-w) ** n if recoil > 0.0 else 0.0
+        bend = n * back / -w * path
+        lost = np.expm1(-bend)
+        gone = (1.0 + back) * (-lost / bend if bend > 1e-8 else 1.0) * path
+        if gone <= -w:
+            return sign * limit * (w + gone), k * (1.0 + back) * (1.0 + lost)
+        path, w = path * (1.0 + w / gone), 0.0
+    on = w**n if w > 0.0 else 0.0
+    bend = (n * on / w if w > 0.0 else (1.0 if n == 1.0 else 0.0)) * path
+    lost = np.expm1(-bend)
+    w += (1.0 - on) * (-lost / bend if bend > 1e-8 else 1.0) * path
+    if w >= 1.0:
+        return sign * limit, 0.0
+    return sign * limit * w, k * (1.0 - on) * (1.0 + lost)
+
+
+@njit(cache=True, nogil=True)
+def yielding_point(
+    k: float, limit: float, n: float, recoil: float, h: float, free: float, direct: float, near: float
+) -> tuple[float, float]:
+    """Step ``dx`` that solves ``dx + direct h(dx) = free``, and the torque there: by Newton's steps from ``near``.
+
+    The last of them, which is short, moves the torque along its slope.
+    """
+    low, high = free - direct * limit, free + direct * limit
+    dx = min(max(near, low), high)
+    torque = h
+    for _ in range(60):
+        torque, slope = yielded(k, limit, n, recoil, h, dx)
+        miss = dx + direct * torque - free
+        if miss > 0.0:
+            high = dx
+        else:
+            low = dx
+        step = -miss / (1.0 + direct * slope)
+        if not low <= dx + step <= high:  # Newton's steps go back and forth about a kink
+            step = 0.5 * (low + high) - dx
+        dx += step
+        if abs(step) * k <= SHORT * limit:
+            torque += slope * step
+            break
+    return dx, min(max(torque, -limit), limit)

@@ -1,0 +1,85 @@
+"""Elements that yield, against the differential equation, closed forms and each other."""
+
+import numpy as np
+import pytest
+import scipy.integrate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.hypotheses.yielding import SLIP, along_path, bristle, elastoplastic, yielded, yielding_point
+
+STIFFNESS, LIMIT = 80.0, 0.2
+EXPONENTS = [(1.0, 0.0), (1.0, 1.0), (2.0, 0.5), (4.0, 1.2), (12.0, 0.0)]
+AMPLITUDES = 0.6 * LIMIT / STIFFNESS * np.array([4.0, 0.0, 1.5, 0.0, 0.8])
+
+
+def path(t):
+    """Of period 1, and its rate."""
+    phases = 2 * np.pi * np.arange(1, 6)[:, None] * t + np.arange(5)[:, None]
+    return AMPLITUDES @ np.sin(phases), AMPLITUDES * 2 * np.pi * np.arange(1, 6) @ np.cos(phases)
+
+
+def along(points, exponent, recoil):
+    x, _ = path(np.arange(points) / points)
+    return along_path((x - np.roll(x, 1))[None], STIFFNESS, LIMIT, exponent, recoil)[0]
+
+
+@pytest.mark.parametrize(("exponent", "recoil"), EXPONENTS)
+def test_it_follows_the_differential_equation(exponent, recoil):
+    def rate(t, h):
+        v = path(np.array([t]))[1][0]
+        share = min(abs(h[0]) / LIMIT, 1.0) ** exponent
+        return [STIFFNESS * v * (1.0 - share if v * h[0] > 0 else 1.0 + recoil * share)]
+
+    t = np.arange(4000) / 4000
+    expected = scipy.integrate.solve_ivp(rate, (-1.0, 1.0), [0.0], t_eval=t, rtol=1e-8, atol=1e-9, max_step=2e-3).y[0]
+    assert along(4000, exponent, recoil) == pytest.approx(expected, abs=2e-4 * LIMIT)
+
+
+@pytest.mark.parametrize(("exponent", "recoil"), EXPONENTS)
+def test_the_step_is_of_second_order(exponent, recoil):
+    fine = along(32000, exponent, recoil)
+    errors = [np.std(along(n, exponent, recoil) - fine[:: 32000 // n]) for n in (500, 1000, 2000)]
+    assert errors[0] / errors[2] > 8.0  # 16 but for the kinks where the path turns
+
+
+def test_a_bristle_is_exact_over_steps_of_constant_velocity():
+    """Dahl's closed form along a saw tooth, sampled at its corners and between them alike (Dahl 1968)."""
+    length, dt = 1e-3, 0.01
+    v = np.r_[np.full(10, 0.05), np.full(10, -0.05)]
+    z = bristle(np.repeat(v, 40)[None], dt / 40, length)[0]
+    rise = 0.05 * dt * 10 / length  # of the path along one flank, in breakaway lengths
+    end = np.expm1(rise) / (np.exp(rise) + 1.0)  # symmetric loop: w = 1 - (1 + w) exp(-rise)
+    assert z.max() == pytest.approx(end, rel=2e-2) and z.min() == pytest.approx(-end, rel=2e-2)
+
+
+def test_a_sharp_element_is_a_maxwell_slip():
+    x, _ = path(np.arange(2000) / 2000)
+    slip = elastoplastic(x[None], STIFFNESS, LIMIT)[0]
+    assert along(2000, SLIP, 0.7) == pytest.approx(slip)
+    assert along(2000, 0.99 * SLIP, 0.0) == pytest.approx(slip, abs=0.05 * LIMIT)
+    held = np.clip(STIFFNESS * 1e-3 + np.zeros(1), -LIMIT, LIMIT)
+    assert yielded(STIFFNESS, LIMIT, SLIP, 0.0, 0.0, 1e-3)[0] == pytest.approx(held[0])
+
+
+@given(st.floats(0.5, 60.0), st.floats(0.0, 1.5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
+@settings(max_examples=500, deadline=None)
+def test_a_step_stays_within_the_limit_and_never_turns_against_its_path(exponent, recoil, start, step):
+    h, dx = start * LIMIT, step * LIMIT / STIFFNESS
+    new, slope = yielded(STIFFNESS, LIMIT, exponent, recoil, h, dx)
+    assert abs(new) <= LIMIT * (1 + 1e-12) and slope >= 0.0
+    assert (new - h) * np.sign(dx) >= -1e-12 * LIMIT
+    further, _ = yielded(STIFFNESS, LIMIT, exponent, recoil, h, 1.1 * dx)
+    assert (further - new) * np.sign(dx) >= -1e-9 * LIMIT
+
+
+@given(
+    st.floats(0.5, 60.0), st.floats(0.0, 1.5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0), st.floats(0.0, 0.5), st.floats(-2.0, 2.0)
+)
+@settings(max_examples=500, deadline=None)
+def test_the_step_of_a_loop_solves_its_equation(exponent, recoil, start, free, give, near):
+    """``dx + direct h(dx) = free`` with a compliance ``direct`` within a step of up to half of that of the element."""
+    at = LIMIT / STIFFNESS
+    dx, h = yielding_point(STIFFNESS, LIMIT, exponent, recoil, start * LIMIT, free * at, give / STIFFNESS, near * at)
+    assert h == pytest.approx(yielded(STIFFNESS, LIMIT, exponent, recoil, start * LIMIT, dx)[0], abs=1e-4 * LIMIT)
+    assert dx + give / STIFFNESS * h == pytest.approx(free * at, abs=1e-4 * at)
