@@ -133,10 +133,23 @@ def _figures(robot: Robot, drives: dict[str, np.ndarray] | None) -> dict[str, np
 
 
 def _hinges(robot: Robot, effects: Sequence) -> list[Elasticity]:
+    """Of the arm and of effects.
+
+    Raises:
+        DataError: where two turn about one axis: what turns between them would have no inertia.
+    """
     hinges = list(robot.elasticities)
     for effect in effects:
-        hinges += getattr(effect, "hinges", lambda: ())()
+        for new in getattr(effect, "hinges", lambda: ())():
+            for old in hinges:
+                if (old.joint, old.before) == (new.joint, new.before) and _parallel(old.axis, new.axis):
+                    raise DataError("axis", new.name, f"that of the elasticity {old.name}", "an axis across it")
+            hinges.append(new)
     return hinges
+
+
+def _parallel(a: Sequence[float], b: Sequence[float]) -> bool:
+    return float(np.linalg.norm(np.cross(a, b))) < 1e-6 * float(np.linalg.norm(a) * np.linalg.norm(b))
 
 
 def link_inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:

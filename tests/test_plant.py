@@ -94,6 +94,17 @@ def test_an_elasticity_across_is_drawn_across(name):
     for seed in range(30):
         effect = draw_effect(np.random.default_rng(seed), robot, names=("transverse_elasticity",))
         assert abs(np.dot(effect.axis, axes[effect.place])) < 0.9
+        for hinge in robot.elasticities:
+            assert hinge.joint != effect.place or abs(np.dot(effect.axis, hinge.axis)) < 0.9
+
+
+def test_two_hinges_about_one_axis_are_an_error():
+    """Of the arm's own and a hidden one: what turns between them has no inertia."""
+    irb = load_robot("irb")
+    own = irb.elasticities[0]
+    second = make_effect("transverse_elasticity", own.joint, stiffness=1e6, damping=1e3, axis=own.axis)
+    with pytest.raises(DataError, match=own.name):
+        build_plant(irb, [second])
 
 
 def test_a_simulation_that_diverges_is_an_error(ur10):

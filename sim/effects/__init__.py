@@ -41,6 +41,7 @@ _CLASSES = (
     sensing.SensorDelay,
     sensing.SensorLag,
 )
+PARALLEL = 0.9  # cosine from which on two axes are one
 VECTORS = ("com", "axis")
 DIVISORS = ("stribeck_velocity", "low_stiffness", "transition", "time_constant", "resolution", "yield_torque", "mass", "inertia")
 SIZES = ("torque", "coulomb", "static", "stiffness", "damping", "delay", "limit", "gap", "friction", "coefficient", "cubic")
@@ -118,7 +119,16 @@ def valid_places(name: str, robot: Robot) -> list[str]:
         return moving_links(robot)
     if name == "joint_coupling":
         return list(robot.joint_names[:-1])
+    if name == "transverse_elasticity":
+        return [joint for joint in robot.joint_names if len(free_axes(robot, joint))]
     return list(robot.joint_names)
+
+
+def free_axes(robot: Robot, joint: str) -> np.ndarray:
+    """(axes, 3) axes of a joint's frame across it about which the arm has no elasticity yet."""
+    taken = [read_urdf(robot.urdf).axes[joint], *(h.axis for h in robot.elasticities if h.joint == joint)]
+    axes = np.eye(3)
+    return axes[np.abs(axes @ np.array(taken, float).T).max(axis=1) < PARALLEL]
 
 
 def _value(key: str, text: str, where: str) -> object:
@@ -166,8 +176,9 @@ def draw_effect(
     side = rng.permutation(np.eye(3))[0]
     periods = float(rng.choice([2.0, 4.0])) * joint.gear_ratio / float(rng.choice([1.0, 2.0]))
     k = joint.stiffness
-    own = np.abs(read_urdf(robot.urdf).axes[joint.name])
-    across = side if own @ side < 0.9 else np.roll(side, 1)
+    free = free_axes(robot, joint.name)
+    others = [a for a in (side, np.roll(side, 1), np.roll(side, 2)) if np.any(free @ a)]
+    across = others[0] if others else side
     wrong_link: dict[str, object] = {"mass": 1 + 0.15 * size}
     if rng.random() < 0.7:
         wrong_link["inertia"] = 1 + 0.15 * size
