@@ -222,10 +222,11 @@ def diagnose_fully(
     setup, baseline = identify(dataset, progress=say)
     recorded = setup.problem.groups
     linked = None if doubts else by_link_encoders(dataset, setup, baseline, max_causes, workers)
+    if linked is None or not explained(linked[-1]):
+        result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
+        linked = linked if linked is not None and linked[-1].detected and not result.detected else None
     if linked is not None:
         setup, recorded, baseline, result = linked
-    else:
-        result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     nominal, rigid = setup.problem.nominal, None
     if linked is None and unresolved(result) and not doubts and not workers.late and setup.problem.motions_alone:
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
@@ -337,13 +338,14 @@ def unresolved(result: Attribution) -> bool:
 def by_link_encoders(
     dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
 ) -> tuple[Setup, tuple[Group, ...], Fit, Attribution] | None:
-    """Causes sought in torque and link encoders together, where those then explain what both show; else None.
+    """Causes sought in torque and link encoders together.
 
     Link encoders of a real arm have errors of their own, and with links that are not those of the model what they show
-    of the gears belies its torque: the torque alone then says more.
+    of the gears belies its torque. Where these causes do not explain what both show, the torque alone says more,
+    if it shows anything.
 
     Returns:
-        The setup that was fitted, its groups as recorded, baseline and causes.
+        The setup that was fitted, its groups as recorded, baseline and causes; None where there is no such fit.
     """
     if not comparable_links(setup.problem):
         return None
@@ -361,8 +363,12 @@ def by_link_encoders(
         found = attribute(wide.problem, both, max_causes=max_causes, workers=workers.for_half())
     except NOT_COMPUTED:
         return None
-    explained = found.detected and not found.unknown and found.left_share <= LEFT_BY_BOTH
-    return (wide, recorded, both, found) if explained else None
+    return wide, recorded, both, found
+
+
+def explained(result: Attribution) -> bool:
+    """Whether causes found in torque and link encoders explain what both show."""
+    return result.detected and not result.unknown and result.left_share <= LEFT_BY_BOTH
 
 
 def with_inertias(
