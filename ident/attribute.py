@@ -19,7 +19,7 @@ from ident.evidence import ABSENT, Candidate, explained, pointless, rivals_of_be
 from ident.extended import Effect, is_along_record
 from ident.hypotheses import Hypothesis, catalogue
 from ident.parallel import Workers
-from ident.screening import Score, screen
+from ident.screening import Score, screen, signal_scale
 from ident.search import (
     FAINT,
     FINALISTS,
@@ -35,6 +35,7 @@ from ident.search import (
     polish,
     refit,
     reweighted,
+    simulated,
     under_noise_of_best,
     worth_a_hinge,
     worth_a_refit,
@@ -140,6 +141,7 @@ def attribute(
         taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in current.model.effects}
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
+    current = as_loops(problem, current)
     current, rounds = rematched(problem, current, rounds, workers)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
@@ -180,7 +182,8 @@ def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: 
     for found in rounds:
         winner = found.candidates[0].hypothesis
         there = {e.hypothesis.key for e in current.model.effects}
-        if (len(there) > 1 or outdone(found)) and winner.key in there and not winner.decoy and not workers.late:
+        blurred = len(there) > 1 or outdone(found) or not settled(current)
+        if blurred and winner.key in there and not winner.decoy and not workers.late:
             current, found = contest(problem, current, found, workers)
         out.append(found)
     return current, out
@@ -194,16 +197,21 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     others = tuple(e for e in effects if e.hypothesis.key != winner.key)
     own = next(e for e in effects if e.hypothesis.key == winner.key)
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and c.hypothesis.key not in there]
+    rivals = [*rivals[:FINALISTS], *([] if settled(current) else wider(problem, current, own))]
 
     def entered(effect: Effect) -> Fit | None:
         model = replace(current.model, effects=(*others, effect))
         return refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
 
-    entrants = [own, *rivals[:FINALISTS]] if rivals else []
+    entrants = [own, *rivals] if rivals else []
     fits = workers.map_in_time(entered, entrants, lambda e: f"again: {e.hypothesis.effect} at {e.hypothesis.place}")
     ran = [Candidate(e.hypothesis, r, 0.0) for e, r in zip(entrants, fits, strict=True) if r is not None]
     if len(ran) < 2 or ran[0].hypothesis is not own.hypothesis:
         return current, found
+    best_of: dict[tuple[str, str], Candidate] = {}
+    for c in sorted(ran, key=lambda c: c.fit.cost):
+        best_of.setdefault(c.hypothesis.key, c)
+    ran = list(best_of.values())
     weighed = weigh(ran, max(min(c.fit.cost for c in ran) - current.count, 0.0))
     best = weighed[0]
     if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
@@ -211,9 +219,21 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     elif best.hypothesis is not own.hypothesis:
         current = polish(problem, best.fit)
     now = {c.hypothesis.key: c.probability for c in weighed}
-    known = [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
+    there = {c.hypothesis.key for c in found.candidates}
+    new = [c for c in weighed if c.hypothesis.key not in there]
+    known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
     known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
     return current, replace(found, candidates=tuple(known))
+
+
+def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
+    """Laws of the catalogue that hold an effect as a special case, at several shapes: a linear step may not lead there."""
+    h = effect.hypothesis
+    laws = [x for x in catalogue(problem.structure) if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options]
+    if not laws:
+        return []
+    scale = signal_scale(problem, predictions(problem, current.model, current.remainders), h.joint, ())
+    return [Effect(x, clip_to_bounds(x, p)) for x in laws for p in x.options["widens"](effect.p, scale)]
 
 
 def pruned(problem: Problem, current: Fit) -> Fit:
@@ -243,9 +263,25 @@ def pruned(problem: Problem, current: Fit) -> Fit:
 
 
 def settled(current: Fit) -> bool:
-    """Whether a model leaves no more than noise, as far as that is known: along the record, by a few draws."""
-    along = any(is_along_record(e.hypothesis) for e in current.model.effects)
-    return current.chi2_per_dof <= (RECORD_EXCESS if along else DETECTION_EXCESS)
+    """Whether a model leaves no more than noise, as far as that is known: along the record, by a few draws.
+
+    There the noise of one joint is taken large for all of them, so that each must leave no more.
+    """
+    if any(is_along_record(e.hypothesis) for e in current.model.effects):
+        return bool(np.all(current.costs <= RECORD_EXCESS * current.counts))
+    return current.chi2_per_dof <= DETECTION_EXCESS
+
+
+def as_loops(problem: Problem, current: Fit) -> Fit:
+    """Laws of the gear along the record as loops where they can be, beside all causes that were found by then."""
+    for effect in current.model.effects:
+        if is_along_record(effect.hypothesis):
+            others = tuple(e for e in current.model.effects if e is not effect)
+            last = replace(current, model=replace(current.model, effects=(*others, effect)))
+            kept, other = simulated(problem, effect.hypothesis, last)
+            if not is_along_record(kept):
+                current = polish(problem, other)
+    return current
 
 
 def companions(

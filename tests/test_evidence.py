@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import LEFT_TO_DECOYS, Round, companions, left_share, outdone, pruned, with_name
+from ident.attribute import LEFT_TO_DECOYS, Round, companions, left_share, outdone, pruned, settled, with_name
 from ident.baseline import astray
 from ident.diagnose import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
-from ident.extended import Effect
+from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
@@ -322,3 +322,26 @@ def test_ripples_are_named_at_one_joint_after_another(named):
     ripple = Candidate(named["transmission_error", "elbow_joint"], None, 0.0, 1.0)
     untouched = SimpleNamespace()
     assert companions(None, untouched, ripple, tuple(named.values())) == (untouched, [])
+
+
+@pytest.mark.parametrize(("along", "costs", "expected"), [
+    (False, [1.0, 1.0], True), (False, [1.0, 1.4], False), (True, [0.6, 1.5], True), (True, [0.5, 3.0], False),
+])
+def test_a_law_along_the_record_is_settled_where_no_joint_shows_more(named, along, costs, expected):
+    """Its noise is taken large for all joints: on average two may be at the noise, and one of them far from it."""
+    h = named["hardening_stiffness", "elbow_joint"]
+    model = SimpleNamespace(effects=(Effect(along_record(h) if along else h, np.array([1e8])),))
+    counts = np.array([1000.0, 1000.0])
+    left = SimpleNamespace(model=model, costs=np.array(costs) * counts, counts=counts, chi2_per_dof=float(np.mean(costs)))
+    assert settled(left) is expected
+
+
+def test_plain_friction_widens_to_laws_that_hold_it(named):
+    for effect in ("stribeck_friction", "presliding_friction"):
+        h, size = named[effect, "elbow_joint"], 3.0
+        scale = SimpleNamespace(v=0.1, q=0.02)
+        for p in h.options["widens"](np.array([size, 0.1, 1e-3]), scale):
+            assert len(p) == len(h.parameters) and not pointless(Effect(h, p))
+            assert all(q.lower < v < q.upper or v == q.null for q, v in zip(h.parameters, p, strict=True))
+            special = h.options["special"](p)
+            assert 0.5 * size < special[0] < 2.0 * size
