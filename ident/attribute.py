@@ -48,6 +48,7 @@ RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the 
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
+LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record, from which its loop is begun
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
@@ -273,14 +274,21 @@ def settled(current: Fit) -> bool:
 
 
 def as_loops(problem: Problem, current: Fit) -> Fit:
-    """Laws of the gear along the record as loops where they can be, beside all causes that were found by then."""
+    """Laws of the gear along the record as loops where they can be, beside all causes that were found by then.
+
+    Their size is sought about that along the record, which the noise taken there has blurred.
+    """
     for effect in current.model.effects:
-        if is_along_record(effect.hypothesis):
-            others = tuple(e for e in current.model.effects if e is not effect)
-            last = replace(current, model=replace(current.model, effects=(*others, effect)))
-            kept, other = simulated(problem, effect.hypothesis, last)
-            if not is_along_record(kept):
-                current = polish(problem, other)
+        h = effect.hypothesis
+        if not is_along_record(h):
+            continue
+        others = tuple(e for e in current.model.effects if e is not effect)
+        starts = [Effect(h, np.array([effect.p[0] * factor, *effect.p[1:]])) for factor in LOOP_SIZES]
+        tried = [simulated(problem, h, replace(current, model=replace(current.model, effects=(*others, e)))) for e in starts]
+        loops = [r for kept, r in tried if not is_along_record(kept)]
+        if loops:
+            best = polish(problem, min(loops, key=lambda r: r.cost))
+            current = best if best.costs[h.joint] <= RECORD_EXCESS * best.counts[h.joint] else current
     return current
 
 

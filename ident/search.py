@@ -344,6 +344,9 @@ def beside_strong(
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
     strong += workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
+    # Noise along the record is taken large for all joints: where another cause is missing that flatters it.
+    explained_joints = {h.joint for h, r in (*strong, *ranked) if at_noise(h, r)}
+    strong = [(h, r) for h, r in strong if not (is_along_record(h) and h.joint in explained_joints)]
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
     best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
@@ -370,6 +373,11 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
         and "size" in s.hypothesis.options
         and not (problem.motions_alone and s.hypothesis.channel == "spring")
     ]
+
+
+def at_noise(h: Hypothesis, result: Fit) -> bool:
+    """Whether a hypothesis that is predicted whole leaves nothing but noise at its joint."""
+    return h.joint >= 0 and not is_along_record(h) and bool(result.costs[h.joint] <= DETECTION_EXCESS * result.counts[h.joint])
 
 
 def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:

@@ -42,24 +42,29 @@ def test_a_hidden_effect_is_found(ur10, tmp_path, name):
     assert verdict.gain.gap_closed > 0.85 and verdict.gain.after < verdict.gain.before
 
 
-def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path):
+@pytest.mark.parametrize(("power", "coefficient"), [(2.0, 60.0), (0.4, 8.0)])
+def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path, power, coefficient):
     from dataclasses import dataclass
 
     from sim.effects.effect import Torque
 
     @dataclass(frozen=True)
     class Drag:
-        """Quadratic drag, which the catalogue lacks."""
+        """Drag with a power of the speed, which the catalogue lacks; linear within 1 mrad/s, so that it can be stepped."""
 
         place: str
-        coefficient: float
 
         def torque(self, run):
             j = run.joint(self.place)
-            return lambda x: Torque(j, -self.coefficient * x.v[:, j] * np.abs(x.v[:, j]))
+
+            def drag(x):
+                v = x.v[:, j]
+                return Torque(j, -coefficient * v * np.maximum(np.abs(v), 1e-3) ** (power - 1.0))
+
+            return drag
 
     drives = draw_drives(np.random.default_rng(3), ur10)
-    data = run_experiment(small_plan(ur10, 3), [Drag("elbow_joint", 60.0)], seed=3, drives=drives)
+    data = run_experiment(small_plan(ur10, 3), [Drag("elbow_joint")], seed=3, drives=drives)
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
     assert verdict.unexplained_verdict == "unknown cause remains"

@@ -48,6 +48,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         out += [make(j, name) for make in PER_JOINT]
         out.append(structure.dress_pack(j, name, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
+        out.append(friction.rising_friction(j, name))
         out.append(friction.position_friction(j, name))
         out.append(structure.link_friction(j, name))
         if offsets:

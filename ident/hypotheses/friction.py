@@ -16,6 +16,8 @@ ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
 REST_QUANTILE = 0.95  # of what a friction balances at rest, that says its size
 LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
+SHARP_SHARE = 2e-3  # the same, over the rms velocity
+RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
 
@@ -261,6 +263,39 @@ def velocity_power(joint: int, place: str, power: int) -> Hypothesis:
         lambda scale: [()],
         lambda motion, j, k, shape: Screen((unit(motion, j),), lambda c: np.array([c[0]]), ()),
         "The residual torque of {joint} grows with a power of its velocity.",
+    )
+
+
+def rising_friction(joint: int, place: str) -> Hypothesis:
+    """Decoy: friction that grows with a power of the speed below one, ``coefficient |v|^exponent sign(v)``.
+
+    Between Coulomb's and a viscous one; thin lubricants rub like that.
+    """
+
+    def unit(motion: Motion, j: int, exponent: float, smoothing: float) -> np.ndarray:
+        v = motion.v(j)
+        return np.abs(v) ** exponent * direction(v, smoothing)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        turn = SHARP_SHARE * shape[1]
+        return Screen(
+            (unit(motion, j, shape[0], turn),), lambda c: np.array([c[0], shape[0], turn]) if c[0] > 0 else None, shape
+        )
+
+    return Hypothesis(
+        "unknown:rising_friction",
+        place,
+        joint,
+        "motor",
+        (
+            Parameter("coefficient", "SI", 1e-9, 1e9, log=True),
+            Parameter("exponent", "1", *RISING, nuisance=True, step=1e-2),
+            SMOOTHING,
+        ),
+        lambda p, motion, j, k: p[0] * unit(motion, j, p[1], p[2]),
+        lambda scale: [(e, scale.v) for e in (0.35, 0.6)],
+        screen,
+        "The residual torque of {joint} grows with a power of its speed below one.",
     )
 
 
