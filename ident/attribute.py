@@ -183,7 +183,7 @@ def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: 
     for found in rounds:
         winner = found.candidates[0].hypothesis
         there = {e.hypothesis.key for e in current.model.effects}
-        blurred = len(there) > 1 or outdone(found) or not settled(current)
+        blurred = len(there) > 1 or outdone(found) or nearly_settled(current)
         if blurred and winner.key in there and not winner.decoy and not workers.late:
             current, found = contest(problem, current, found, workers)
         out.append(found)
@@ -198,7 +198,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     others = tuple(e for e in effects if e.hypothesis.key != winner.key)
     own = next(e for e in effects if e.hypothesis.key == winner.key)
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and c.hypothesis.key not in there]
-    rivals = [*rivals[:FINALISTS], *([] if settled(current) else wider(problem, current, own))]
+    rivals = [*rivals[:FINALISTS], *(wider(problem, current, own) if nearly_settled(current) else [])]
 
     def entered(effect: Effect) -> Fit | None:
         model = replace(current.model, effects=(*others, effect))
@@ -271,6 +271,11 @@ def settled(current: Fit) -> bool:
     if any(is_along_record(e.hypothesis) for e in current.model.effects):
         return bool(np.all(current.costs <= RECORD_EXCESS * current.counts))
     return current.chi2_per_dof <= DETECTION_EXCESS
+
+
+def nearly_settled(current: Fit) -> bool:
+    """Whether a little more than noise is left, so that the shape of a law can be what it lacks."""
+    return not settled(current) and current.chi2_per_dof <= FAINT
 
 
 def as_loops(problem: Problem, current: Fit) -> Fit:
