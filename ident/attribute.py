@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -142,7 +143,8 @@ def attribute(
         taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in current.model.effects}
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
-    current = as_loops(problem, current)
+    if not workers.late:
+        current = as_loops(problem, current, workers)
     current, rounds = rematched(problem, current, rounds, workers)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
@@ -220,8 +222,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     elif best.hypothesis is not own.hypothesis:
         current = polish(problem, best.fit)
     now = {c.hypothesis.key: c.probability for c in weighed}
-    there = {c.hypothesis.key for c in found.candidates}
-    new = [c for c in weighed if c.hypothesis.key not in there]
+    seen = {c.hypothesis.key for c in found.candidates}
+    new = [c for c in weighed if c.hypothesis.key not in seen]
     known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
     known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
     return current, replace(found, candidates=tuple(known))
@@ -230,7 +232,12 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
 def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
     """Laws of the catalogue that hold an effect as a special case, at several shapes: a linear step may not lead there."""
     h = effect.hypothesis
-    laws = [x for x in catalogue(problem.structure) if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options]
+    there = {e.hypothesis.key for e in current.model.effects}
+    laws = [
+        x
+        for x in catalogue(problem.structure)
+        if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options and x.key not in there
+    ]
     if not laws:
         return []
     scale = signal_scale(problem, predictions(problem, current.model, current.remainders), h.joint, ())
@@ -278,19 +285,17 @@ def nearly_settled(current: Fit) -> bool:
     return not settled(current) and current.chi2_per_dof <= FAINT
 
 
-def as_loops(problem: Problem, current: Fit) -> Fit:
+def as_loops(problem: Problem, current: Fit, workers: Workers) -> Fit:
     """Laws of the gear along the record as loops where they can be, beside all causes that were found by then.
 
     Their size is sought about that along the record, which the noise taken there has blurred.
     """
-    for effect in current.model.effects:
-        h = effect.hypothesis
-        if not is_along_record(h):
-            continue
-        others = tuple(e for e in current.model.effects if e is not effect)
-        starts = [Effect(h, np.array([effect.p[0] * factor, *effect.p[1:]])) for factor in LOOP_SIZES]
-        tried = [simulated(problem, h, replace(current, model=replace(current.model, effects=(*others, e)))) for e in starts]
-        loops = [r for kept, r in tried if not is_along_record(kept)]
+    for h in [e.hypothesis for e in current.model.effects if is_along_record(e.hypothesis)]:
+        others = tuple(e for e in current.model.effects if e.hypothesis.key != h.key)
+        size, *shape = next(e.p for e in current.model.effects if e.hypothesis.key == h.key)
+        models = [(*others, Effect(h, np.array([size * factor, *shape]))) for factor in LOOP_SIZES]
+        starts = [replace(current, model=replace(current.model, effects=effects)) for effects in models]
+        loops = [r for kept, r in workers.map(partial(simulated, problem, h), starts) if not is_along_record(kept)]
         if loops:
             best = polish(problem, min(loops, key=lambda r: r.cost))
             current = best if best.costs[h.joint] <= RECORD_EXCESS * best.counts[h.joint] else current

@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ident.attribute import as_loops
 from ident.diagnose import set_up
 from ident.extended import Effect, Model, along_record, is_along_record, joints_along_record, predict
 from ident.hypotheses import catalogue, kernels
 from ident.hypotheses.yielding import elastoplastic
+from ident.parallel import Workers
 from ident.search import simulated
 from ident.torque_fit import fit, jacobian, joint_costs, make_weights, pack, predictions, unpack
 from robot_assets.robot import load_robot
@@ -141,7 +143,12 @@ def test_a_gear_with_one_steady_motion_ends_as_a_loop(tmp_path, cubic):
     problem = set_up(through_files(run_experiment(small_plan(ur10, 8), hidden, seed=8), tmp_path)).problem
     h = along_record(next(h for h in catalogue(problem.structure) if h.key == ("hardening_stiffness", "elbow_joint")))
     start = Model(problem.structure, problem.nominal, (Effect(h, np.array([0.7 * cubic])),))
-    found, result = simulated(problem, h, fit(problem, start, iterations=15))
+    along = fit(problem, start, iterations=15)
+    found, result = simulated(problem, h, along)
     assert not is_along_record(found)
     assert result.model.effects[0].p[0] == pytest.approx(cubic, rel=0.01)
     assert result.chi2_per_dof < 1.1
+    # From a size that the noise along the record has blurred, too.
+    far = replace(along, model=replace(along.model, effects=(Effect(h, np.array([0.6 * cubic])),)))
+    (law,) = as_loops(problem, far, Workers()).model.effects
+    assert not is_along_record(law.hypothesis) and law.p[0] == pytest.approx(cubic, rel=0.01)

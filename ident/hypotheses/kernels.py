@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ident.hypotheses.yielding import SLIP, yielded, yielding_point
+from ident.hypotheses.yielding import SLIP, along_path, yielding_point
 
 TURNED = 19.1  # argument beyond which tanh is one in double precision
 VECTORS = {"contract", "reassoc", "nsz"}  # what lets the compiler step several records at once
@@ -56,9 +56,7 @@ def smooth_sign(v: np.ndarray, smoothing: float) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def spring_torque(
-    code: int, a: float, b: float, k: float, exponent: float, recoil: float, x: float, x_old: float, h_old: float
-) -> float:
+def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: float, h_old: float) -> float:
     """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``; or of a ``CABLE``, see ``loop_sweep``, on a link."""
     if code == 5:
         return a * x + min(max(h_old - a * x_old + k * (x - x_old), -b), b)
@@ -77,7 +75,7 @@ def spring_torque(
         if x < -b:
             return -(a - k) * b
         return (a - k) * x
-    return yielded(a, b, exponent, recoil, h_old, x - x_old)[0]
+    return min(max(h_old + a * (x - x_old), -b), b)
 
 
 @njit(cache=True, nogil=True)
@@ -149,15 +147,12 @@ def along_deflection(
         x: (S, T) rad; mean: (S,) N m of ``k x`` and the law; bisections: at most; 0 leaves ``x`` where it is.
     """
     S, T = x.shape
-    out = np.empty((S, T))
     if code == 3:
-        for i in range(S):
-            h = 0.0
-            for _ in range(2):
-                for t in range(T):
-                    h = yielded(a, b, exponent, recoil, h, x[i, t] - x[i, t - 1])[0]
-                    out[i, t] = h
-        return out
+        steps = np.empty((S, T))
+        steps[:, 0] = x[:, 0] - x[:, T - 1]
+        steps[:, 1:] = x[:, 1:] - x[:, : T - 1]
+        return along_path(steps, a, b, exponent, recoil)
+    out = np.empty((S, T))
     least = k if code != 2 else min(a, k)
     for i in range(S):
         reach = abs(mean[i]) / least + np.abs(x[i]).max() + (a if code == 1 else b)
@@ -167,7 +162,7 @@ def along_deflection(
             total = 0.0
             for t in range(T):
                 new = x[i, t] + offset
-                out[i, t] = spring_torque(code, a, b, k, exponent, recoil, new, new, 0.0)
+                out[i, t] = spring_torque(code, a, b, k, new, new, 0.0)
                 total += k * new + out[i, t]
             miss = total / T - mean[i]
             if code != 1 and abs(miss) <= 1e-11 * k * reach:
@@ -276,7 +271,7 @@ def loop_sweep(
                     new = x[i] + step
                 else:
                     new = spring_point(code, a, b, k, free[i], direct, x[i], past[i], h[i])
-                    h[i] = spring_torque(code, a, b, k, exponent, recoil, new, x[i], h[i])
+                    h[i] = spring_torque(code, a, b, k, new, x[i], h[i])
                 past[i] = x[i]
                 x[i] = new
         for m in range(len(decay)):

@@ -38,7 +38,7 @@ def steady_loop(
     elif code == CABLE:
         h = a * x
     else:
-        h = np.array([spring_torque(*law, v, v, 0.0) for v in x])
+        h = np.array([spring_torque(code, a, b, k, v, v, 0.0) for v in x])
     memory, left = np.stack([x, x, h]), np.arange(S)
     out, part = np.zeros((T, S)), np.zeros((T, S))
     past: list[tuple[np.ndarray, np.ndarray]] = []
