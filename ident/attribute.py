@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, implausible
-from ident.evidence import ABSENT, Candidate, explained, pointless, rivals_of_best, weigh
+from ident.evidence import ABSENT, WAVE, Candidate, explained, is_wave, pointless, rivals_of_best, weigh
 from ident.extended import Effect, is_along_record
 from ident.hypotheses import Hypothesis, catalogue
 from ident.parallel import Workers
@@ -258,7 +258,9 @@ def pruned(problem: Problem, current: Fit) -> Fit:
         h = effect.hypothesis
         own = [(q, v, std[f"{h.effect}@{h.place}:{q.name}"]) for q, v in zip(h.parameters, effect.p, strict=True) if not q.nuisance]
         off = [abs(q.to_internal(v) - q.to_internal(q.null)) / s for q, v, s in own if q.null is not None]
-        sizes = [s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in own if q.null is None]
+        # A wave that is not there may still have a length.
+        wave = is_wave(h.parameters)
+        sizes = [s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in own if q.null is None and (not wave or q.name in WAVE)]
         return all(sizes) if sizes else all(x < ABSENT for x in off)
 
     effects = current.model.effects

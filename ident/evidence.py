@@ -19,6 +19,7 @@ MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may 
 STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
 POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found absent
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
+WAVE = "sine", "cosine"  # parameters of an effect that repeats along its variable
 RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
 
 
@@ -119,9 +120,9 @@ def occam(candidate: Candidate, temper: float) -> float:
     if count == 0:
         return -nats
     own = np.linalg.inv(inverse(H[np.ix_(keep, keep)], STEADY)[-count:, -count:])
-    amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in ("sine", "cosine"))) if _wave(ps) else 0.0
+    amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in WAVE)) if is_wave(ps) else 0.0
     spread = np.array(
-        [q.expected_spread(amplitude if q.name in ("sine", "cosine") else v) for q, v in zip(ps, effect.p, strict=True)]
+        [q.expected_spread(amplitude if q.name in WAVE else v) for q, v in zip(ps, effect.p, strict=True)]
     )[~absent]
     narrowed = np.linalg.slogdet(np.eye(count) + own * np.outer(spread, spread) / temper)[1]
     stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
@@ -137,5 +138,6 @@ def pointless(effect: Effect) -> bool:
     return at_bound or bool(h.options.get("trivial", lambda p: False)(effect.p))
 
 
-def _wave(parameters: Sequence[Parameter]) -> bool:
-    return {"sine", "cosine"} <= {q.name for q in parameters}
+def is_wave(parameters: Sequence[Parameter]) -> bool:
+    """Whether parameters are those of a wave: its two amplitudes, and where they are seen."""
+    return set(WAVE) <= {q.name for q in parameters}

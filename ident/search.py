@@ -17,7 +17,18 @@ from ident.extended import Effect, Model, Prediction, along_record, as_loop, is_
 from ident.hypotheses import Hypothesis
 from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
-from ident.torque_fit import ANNEALING, Fit, Problem, Weights, anneal, fit, joint_costs, make_weights, predictions
+from ident.torque_fit import (
+    ANNEALING,
+    Fit,
+    Problem,
+    Weights,
+    anneal,
+    fit,
+    joint_costs,
+    make_weights,
+    predictions,
+    relative_noise,
+)
 
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain where the baseline is hopeless
 FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched by linear steps alone
@@ -30,6 +41,7 @@ ANSWERED = 0.2  # share of the excess that the best may leave after the first st
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
 HOPEFUL = 5  # candidates fitted further after the first steps
 AS_GOOD = 0.8  # cost of a loop over that along the record, below which it is the loop that is right
+CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
@@ -40,7 +52,6 @@ MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
 WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: linear steps understate strong effects
-WORTH_A_REFIT_FAINT = 0.1  # the same where what is left is faint
 
 
 def revived(problem: Problem, model: Model) -> Model:
@@ -98,7 +109,7 @@ def worth_a_refit(current: Fit) -> float:
         return CLEAR_ANSWER
     if current.chi2_per_dof > STRONG:
         return 0.0
-    return WORTH_A_REFIT if current.chi2_per_dof > FAINT else WORTH_A_REFIT_FAINT
+    return WORTH_A_REFIT
 
 
 def worth_a_hinge(current: Fit) -> float:
@@ -207,6 +218,8 @@ def explore(
 
     def started(score: Score) -> Fit | None:
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
+        if stage.chi2_per_dof <= FAINT and misled(problem, stage, model):
+            return None
         return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
 
     def finished(result: Fit) -> Fit:
@@ -224,6 +237,16 @@ def explore(
         last = workers.map(finished, [r for _, r in found])
         found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores
+
+
+def misled(problem: Problem, stage: Fit, model: Model) -> bool:
+    """Whether a model has lost the data that the one which it was made of follows: a step that was not linear."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            preds = predictions(problem, model, stage.remainders)
+    except NOT_COMPUTED:
+        return True
+    return not np.sum(joint_costs(problem, preds, stage.weights)) <= STRONG * stage.count
 
 
 def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
@@ -344,9 +367,8 @@ def beside_strong(
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
     strong += workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
-    # Noise along the record is taken large for all joints: where another cause is missing that flatters it.
-    explained_joints = {h.joint for h, r in (*strong, *ranked) if at_noise(h, r)}
-    strong = [(h, r) for h, r in strong if not (is_along_record(h) and h.joint in explained_joints)]
+    whole = [r for h, r in (*strong, *ranked) if not is_along_record(h)]
+    strong = [(h, r) for h, r in strong if not (is_along_record(h) and any(matched(problem, h.joint, r, w) for w in whole))]
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
     best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
@@ -375,9 +397,19 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
     ]
 
 
-def at_noise(h: Hypothesis, result: Fit) -> bool:
-    """Whether a hypothesis that is predicted whole leaves nothing but noise at its joint."""
-    return h.joint >= 0 and not is_along_record(h) and bool(result.costs[h.joint] <= DETECTION_EXCESS * result.counts[h.joint])
+def matched(problem: Problem, joint: int, along: Fit, other: Fit) -> bool:
+    """Whether a model that is predicted whole leaves noise at a joint, or about what one along the record leaves.
+
+    Noise along the record is taken large for all joints, which flatters what it is compared with, most of all where
+    another cause is missing. Both are seen in that noise, each less what its own noise is in those units.
+    """
+    if other.costs[joint] <= DETECTION_EXCESS * other.counts[joint]:
+        return True
+    left = max(along.costs[joint] - along.counts[joint], 0.0)
+    preds = predictions(problem, other.model, other.remainders)
+    cost = joint_costs(problem, preds, along.weights)[joint]
+    noise = along.counts[joint] * relative_noise(problem, other.weights, along.weights)[joint]
+    return bool(left >= CLEARLY_BETTER * (cost - noise))
 
 
 def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:

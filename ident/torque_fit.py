@@ -629,6 +629,21 @@ def joint_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights)
     return total
 
 
+def relative_noise(problem: Problem, own: Weights, other: Weights) -> np.ndarray:
+    """Cost that the noise which weights stand for has under others, over that under themselves, by joint; (n,)."""
+
+    def under(weights: Weights) -> np.ndarray:
+        total = np.zeros(problem.structure.n)
+        for group, whiten, covariance in zip(problem.groups, weights.whiten, own.covariance, strict=True):
+            spread = np.matmul(whiten, np.linalg.cholesky(covariance))
+            each = len(group.segments) * np.sum(np.abs(spread) ** 2, axis=(0, 2))
+            total += each[: len(total)]
+            total[list(group.links)] += each[len(total) :]
+        return total
+
+    return under(other) / under(own)
+
+
 def _normal(
     problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -16,8 +16,17 @@ from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.search import polish
-from ident.torque_fit import PRIOR_LOG_STD, RIDGE, inverse, joint_costs, predictions, weighted_cost
+from ident.search import matched, misled, polish
+from ident.torque_fit import (
+    PRIOR_LOG_STD,
+    RIDGE,
+    Weights,
+    inverse,
+    joint_costs,
+    predictions,
+    relative_noise,
+    weighted_cost,
+)
 from ident.trust import shadowed
 from ident.verdict import Gain
 from robot_assets.robot import load_robot
@@ -281,14 +290,63 @@ def test_an_extension_that_surely_harms_is_taken_back(interval, bad):
     assert not harmful(None)
 
 
-def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified, named):
-    """The data hold no effect: a friction that was let in stands for nothing, whichever place it has among others."""
+@pytest.mark.parametrize("effect, start", [("coulomb_friction", (1e-5, 0.0, 1e-3)), ("cogging", (1e-3, 101.0, 1e-3))])
+def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified, named, effect, start):
+    """The data hold no effect: a friction that was let in stands for nothing, and so does a ripple of whatever period."""
     _, setup, result = identified
-    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([1e-5, 0.0, 1e-3]))
-    model = replace(result.model, effects=(rub,))
+    model = replace(result.model, effects=(Effect(named[effect, "elbow_joint"], np.array(start)),))
     found = pruned(setup.problem, polish(setup.problem, replace(result, model=model)))
     assert found.model.effects == ()
     assert found.cost < result.cost * (1.0 + 1e-6)
+
+
+def scaled(weights, factor):
+    """Weights of a noise that is larger by a factor."""
+    return Weights(tuple(w / factor for w in weights.whiten), tuple(factor**2 * c for c in weights.covariance))
+
+
+def test_noise_under_other_weights_is_that_of_its_draws(identified):
+    """The closed form against draws of the noise, which is correlated between joints, under weights of another model."""
+    _, setup, result = identified
+    problem, rng = setup.problem, np.random.default_rng(3)
+    own, stiff = result.weights, polish(setup.problem, replace(result, model=replace(result.model, par=setup.problem.nominal))).weights
+    other = scaled(stiff, 3.0)
+    assert relative_noise(problem, own, own) == pytest.approx(1.0)
+    assert relative_noise(problem, own, scaled(own, 3.0)) == pytest.approx(1.0 / 9.0)
+    drawn = np.zeros((2, problem.structure.n))
+    for g, group in enumerate(problem.groups):
+        root = np.linalg.cholesky(own.covariance[g])
+        for _ in range(200):
+            white = rng.normal(size=(len(group.segments), *root.shape[:2])) + 1j * rng.normal(size=(len(group.segments), *root.shape[:2]))
+            noise = np.matmul(root, white[..., None])[..., 0]
+            for i, weights in enumerate((own, other)):
+                drawn[i] += np.sum(np.abs(weights.apply(g, noise)) ** 2, axis=(0, 1))[: problem.structure.n]
+    assert relative_noise(problem, own, other) == pytest.approx(drawn[1] / drawn[0], rel=0.03)
+
+
+def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named):
+    """Larger noise makes every residual small: seen in the same noise, a model that leaves noise is as good."""
+    _, setup, result = identified
+    problem, joint = setup.problem, 2
+    rub = replace(result.model, effects=(Effect(named["coulomb_friction", "elbow_joint"], np.array([5.0, 0.0, 1e-3])),))
+    preds = predictions(problem, rub, result.remainders)
+    wrong = replace(result, model=rub, costs=joint_costs(problem, preds, result.weights))
+    loud = scaled(result.weights, 10.0)
+    flattered = replace(result, weights=loud, costs=joint_costs(problem, predictions(problem, result.model, result.remainders), loud))
+    assert wrong.costs[joint] > 2.0 * wrong.counts[joint] > flattered.costs[joint]
+    assert matched(problem, joint, flattered, result)
+    assert not matched(problem, joint, flattered, wrong)
+    # The same error in noise so large that it hides it is not less of an error.
+    hidden = replace(wrong, weights=loud, costs=wrong.counts + 0.01 * (wrong.costs - wrong.counts))
+    assert matched(problem, joint, hidden, wrong)
+
+
+def test_a_start_that_loses_the_data_is_told_from_one_that_does_not(identified, named):
+    _, setup, result = identified
+    rub = named["coulomb_friction", "elbow_joint"]
+    small, large = (replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3])),)) for t in (1e-3, 50.0))
+    assert not misled(setup.problem, result, small)
+    assert misled(setup.problem, result, large)
 
 
 def test_an_effect_that_the_data_need_stays(ur10, tmp_path):
