@@ -36,6 +36,7 @@ STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under 
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
+STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit goes on to the next ones
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
@@ -355,7 +356,7 @@ def beside_strong(
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                return anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS)
+                return anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP)
         except NOT_COMPUTED:
             return None
 

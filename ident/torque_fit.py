@@ -30,7 +30,7 @@ ANNEALING = (0.5, 0.1, 0.02, 0.0)
 LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
 STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
 LINK_ERROR = 0.01  # of the wind-up that link encoders show, up to which what a model leaves is an error of its law
-GAP = 1e-6  # relative change of the cost that ends a fit
+GAP = 1e-6  # relative fall of the cost that ends a fit
 LEAST_NOISE = 0.5  # of the noise of a linear arm, that is left in any direction of the residual
 LEAST_INFORMATION = 1e-12  # on a coordinate: less counts as this
 RIDGE = 1e-12  # relative, of a covariance
@@ -426,6 +426,7 @@ def anneal(
     *,
     ladder: Sequence[float] = ANNEALING,
     iterations: int = 12,
+    gap: float = GAP,
     remainders: Sequence[np.ndarray] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
@@ -443,6 +444,7 @@ def anneal(
                 rho=rho,
                 hold=HOLD if rho >= HELD else 0.0,
                 iterations=iterations,
+                gap=gap,
                 remainders=stages[-1].remainders if stages else remainders,
                 progress=None if progress is None else lambda text, i=i: progress(f"{text}, stage {i + 1}/{len(ladder)}"),
             )
@@ -457,6 +459,7 @@ def fit(
     rho: float = 0.0,
     hold: float = 0.0,
     iterations: int = 12,
+    gap: float = GAP,
     weights: Weights | None = None,
     remainders: Sequence[np.ndarray] | None = None,
     progress: Callable[[str], None] | None = None,
@@ -469,6 +472,7 @@ def fit(
         hold: penalty on the drives by their squared distance from the starting guesses, natural logarithm, beyond the
             weak prior; in units of the data that are compared.
         iterations: at most.
+        gap: relative fall of the cost in a step below which the fit ends.
         weights: those to fit under; of the start where None.
         remainders: geometric remainders to start from.
     """
@@ -535,7 +539,7 @@ def fit(
                 continue
         if progress is not None:
             progress(f"fit: chi2/dof {cost / count:.3g}")
-        if gain < max(GAP * cost, 0.02):
+        if gain < max(gap * cost, 0.02):
             converged = True
             break
     if np.any(drift):
