@@ -19,8 +19,8 @@ from ident.convert import convert_logs
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
 from ident.show.figures import trace_figure
+from ident.units import torque_unit, unit_suffix
 from ident.verdict import Diagnosis
-from robot_assets.robot import linear_joints
 
 COLOURS = (
     "<style>svg { --ink: #16181a; --soft: #5c666f; --line: #dfe3e6; --before: #c0492f; --after: #1f6f8b; background: #ffffff }</style>"
@@ -122,7 +122,7 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
     if v.causes:
         lines += ["| cause | place | probability | parameters |", "|---|---|---|---|"]
         for c in v.causes:
-            values = ", ".join(f"{k} {x.value:.4g} ± {x.std:.1g} {x.unit}" for k, x in c.parameters.items())
+            values = ", ".join(f"{k} {x.value:.4g} ± {x.std:.1g}{unit_suffix(x.unit)}" for k, x in c.parameters.items())
             lines.append(f"| {c.effect.replace('_', ' ')} | {c.joint} | {c.probability:.2f} | {values} |")
         lines.append("")
     if v.gain is not None:
@@ -130,7 +130,7 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
         closed = "" if g.gap_closed is None else f", {g.gap_closed:.1%} of the gap to the noise"
         if g.gap_closed is not None and g.ci95 is not None:
             closed += f" (95 %: {g.ci95[0]:.1%} to {g.ci95[1]:.1%})"
-        unit = "N" if all(linear_joints(result.robot)) else "N m"
+        unit = torque_unit(result.robot)
         lines += [f"Error on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} {unit}{closed}; noise {g.noise_floor:.2g}.", ""]
     if v.residual_description:
         lines += [v.residual_description, ""]

@@ -9,13 +9,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from robot_assets.errors import DataError
+
+if TYPE_CHECKING:
+    from ident.verdict import Diagnosis
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="Find what a robot simulation gets wrong.")
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
@@ -233,7 +236,7 @@ def diagnose(
         result = diagnose_fully(data, max_causes=max_causes, max_seconds=max_seconds, progress=say, executor=pool)
         say("writing report and recording")
         write_outputs(result, out)
-    _print(result.verdict.to_dict(), json_, _verdict_text(result.verdict, out))
+    _print(result.verdict.to_dict(), json_, _verdict_text(result, out))
 
 
 @app.command()
@@ -275,7 +278,7 @@ def demo(
         write_outputs(result, out)
     truth = {"effect": hidden.name, "place": hidden.place, "parameters": parameters_of(hidden)}
     shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in truth["parameters"].items())
-    text = _verdict_text(result.verdict, out) + f"\nTruth (seed {seed}): {hidden.name} at {hidden.place}, {shown}"
+    text = _verdict_text(result, out) + f"\nTruth (seed {seed}): {hidden.name} at {hidden.place}, {shown}"
     _print({"seed": seed, "truth": truth, "verdict": result.verdict.to_dict()}, json_, text)
 
 
@@ -302,7 +305,7 @@ def _demo_real(name: str, out: Path, json_: bool, quiet: bool) -> None:
     with _progress(quiet or json_) as (say, _):
         result = diagnose_fully(data, progress=say)
         write_outputs(result, out)
-    _print(result.verdict.to_dict(), json_, _verdict_text(result.verdict, out))
+    _print(result.verdict.to_dict(), json_, _verdict_text(result, out))
 
 
 @app.command("robot")
@@ -394,15 +397,18 @@ def _print(data: dict[str, Any], json_: bool, text: str) -> None:
     print(json.dumps(data, indent=2) if json_ else text)
 
 
-def _verdict_text(verdict, out: Path) -> str:
+def _verdict_text(diagnosis: Diagnosis, out: Path) -> str:
+    from ident.units import torque_unit, unit_suffix
+
+    verdict = diagnosis.verdict
     lines = [verdict.sentence]
     for cause in verdict.causes:
-        values = ", ".join(f"{k} {v.value:.4g} ± {v.std:.2g} {v.unit}" for k, v in cause.parameters.items())
+        values = ", ".join(f"{k} {v.value:.4g} ± {v.std:.2g}{unit_suffix(v.unit)}" for k, v in cause.parameters.items())
         lines.append(f"  {cause.effect} at {cause.joint}, probability {cause.probability:.3f}: {values}")
         lines += [f"    or {a.effect} at {a.joint}, {a.probability:.3f}" for a in cause.alternatives]
     if verdict.gain is not None:
         g = verdict.gain
-        lines.append(f"Torque error on held-out data: {g.before:.4g} -> {g.after:.4g} N m, noise {g.noise_floor:.4g}")
+        lines.append(f"Torque error on held-out data: {g.before:.4g} -> {g.after:.4g} {torque_unit(diagnosis.robot)}, noise {g.noise_floor:.4g}")
     lines.append(f"Unexplained: {verdict.unexplained_verdict} ({verdict.unexplained_share:.2%})")
     if verdict.residual_description:
         lines.append(verdict.residual_description)

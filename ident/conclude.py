@@ -11,7 +11,7 @@ from ident.baseline import UNDETERMINED
 from ident.dataset import Dataset
 from ident.evidence import Candidate, pointless
 from ident.extended import Effect, Prediction, is_along_record
-from ident.graybox import INERTIAL, parameter_unit
+from ident.graybox import INERTIAL
 from ident.hypotheses import Hypothesis
 from ident.link_sensor import LinkDelay
 from ident.next_experiment import NextExperiment, advice
@@ -30,6 +30,7 @@ from ident.trust import (
     shadowed,
     too_fast,
 )
+from ident.units import linear_names, parameter_unit, unit_at
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 AXIS_STEP = 1e-6  # of a tilt
@@ -42,7 +43,8 @@ def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:
     x = np.exp(result.model.par.to_log())
     std = np.sqrt(np.maximum(np.diag(result.covariance())[:m], 0.0))
     names = result.names[:m]
-    values = {n: Value(float(v), float(v * s), parameter_unit(n)) for n, v, s in zip(names, x, std, strict=True)}
+    linear = linear_names(result.model.structure.robot)
+    values = {n: Value(float(v), float(v * s), parameter_unit(n, linear)) for n, v, s in zip(names, x, std, strict=True)}
     return values, tuple(n for n, s in zip(names, std, strict=True) if not s < UNDETERMINED)
 
 
@@ -230,6 +232,7 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
     """Parameters under their catalogue names, SI, with standard deviations."""
     h = effect.hypothesis
     index = {name: i for i, name in enumerate(final.names)}
+    linear = h.channel != "model" and h.place in linear_names(final.model.structure.robot)
     out: dict[str, Value] = {}
     std = {}
     for q, v in zip(h.parameters, effect.p, strict=True):
@@ -237,7 +240,7 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
         s = float(np.sqrt(max(covariance[i, i], 0.0)))
         std[q.name] = s * abs(v) if q.log else s
         if q.reported or not q.nuisance:
-            out[q.name] = Value(float(v), std[q.name], q.unit)
+            out[q.name] = Value(float(v), std[q.name], unit_at(q.unit, linear))
     if "sine" in out:
         a, b = out.pop("sine"), out.pop("cosine")
         amplitude = float(np.hypot(a.value, b.value))

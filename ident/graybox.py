@@ -173,21 +173,6 @@ INERTIAL = (
 """Inertial parameters of a body in the frame of its joint, in the order of ``pin.Inertia.toDynamicParameters``."""
 
 
-def parameter_unit(name: str) -> str:
-    """SI unit of a parameter named by ``parameter_names``, of one of ``INERTIAL``, or of what the baseline may hold beside them."""
-    kind = name.split(".")[0]
-    if kind in INERTIAL:
-        return "kg" if kind == "mass" else "kg m" if kind.startswith("first") else "kg m2"
-    return {
-        "stiffness": "N m/rad",
-        "damping": "N m s/rad",
-        "motor_inertia": "kg m2",
-        "viscous_friction": "N m s/rad",
-        "torque_offset": "N m",
-        "link_friction": "N m s/rad",
-    }[kind]
-
-
 def build_structure(
     robot: Robot,
     *,

@@ -15,8 +15,9 @@ from ident.dataset import Dataset
 from ident.diagnose import identify
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.frf import estimate_frf
-from ident.graybox import Parameters, build_structure, parameter_unit
+from ident.graybox import Parameters, build_structure
 from ident.outputs import outputs_into
+from ident.units import linear_names, parameter_unit
 from robot_assets.errors import DataError
 
 
@@ -52,8 +53,9 @@ def identify_and_write(
         )
         x, std = np.exp(fit.parameters.to_log()), np.sqrt(np.maximum(np.diag(fit.covariance), 0))
         names, covariance, undetermined = list(fit.names), fit.covariance, fit.undetermined
+        linear = linear_names(dataset.robot)
         parameters = {
-            n: {"value": float(v), "std": float(v * s), "unit": parameter_unit(n)}
+            n: {"value": float(v), "std": float(v * s), "unit": parameter_unit(n, linear)}
             for n, v, s in zip(names[:-1], x, std[:-1], strict=True)
         }
         extra = {"cost": fit.cost}

@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 import tomlkit
 
-from ident.graybox import LinkChange, build_structure, parameter_unit
+from ident.graybox import LinkChange, build_structure
 from ident.hypotheses.yielding import DAHL, SLIP
-from ident.show.figures import unit_suffix
 from ident.show.slips import maxwell_slips
+from ident.units import unit_suffix
 from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
 
@@ -46,7 +46,7 @@ def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
         entry = {
             "value": value.value,
             "std": value.std,
-            "unit": parameter_unit(name),
+            "unit": value.unit,
             "identified": name not in diagnosis.verdict.unidentified,
         }
         head["parameters"].setdefault(joint, {})[kind] = entry

@@ -47,11 +47,6 @@ CURVE = 300
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def unit_suffix(unit: str) -> str:
-    """The unit behind a number; nothing behind a pure one."""
-    return "" if unit in ("", "1") else f" {unit}"
-
-
 def rounded(value: float, std: float) -> str:
     """A number and its standard deviation, both to two digits of the latter."""
     if not (np.isfinite(std) and std > 0 and np.isfinite(value)):

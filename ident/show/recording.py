@@ -10,7 +10,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ident.graybox import build_structure
-from ident.show.figures import frf_picture, rounded, unit_suffix
+from ident.show.figures import frf_picture, rounded
+from ident.units import torque_unit, unit_suffix
 from ident.verdict import Diagnosis, TorqueTrace
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
@@ -103,10 +104,10 @@ def _markdown(diagnosis: Diagnosis) -> str:
         values = ", ".join(f"{k} = {rounded(x.value, x.std)}{unit_suffix(x.unit)}" for k, x in c.parameters.items())
         rows += [f"**{c.effect.replace('_', ' ')} at {c.joint}**, probability {c.probability:.3f}: {values}", "", c.evidence, ""]
     if v.gain is not None:
-        g = v.gain
+        g, unit = v.gain, torque_unit(diagnosis.robot)
         interval = "" if g.ci95 is None else f" (95 % interval {g.ci95[0]:.1%} to {g.ci95[1]:.1%} of the gap closed)"
         rows.append(
-            f"Torque error on held-out data {g.before:.3g} → {g.after:.3g} N m, noise {g.noise_floor:.3g} N m{interval}."
+            f"Torque error on held-out data {g.before:.3g} → {g.after:.3g} {unit}, noise {g.noise_floor:.3g} {unit}{interval}."
         )
     if v.next_experiment:
         rows.append(f"\n**Next experiment.** {v.next_experiment}")

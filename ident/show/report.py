@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-from ident.graybox import INERTIAL, parameter_unit
+from ident.graybox import INERTIAL
 from ident.show.figures import (
     evidence_figure,
     frf_figure,
     frf_grid_figure,
     rounded,
     trace_figure,
-    unit_suffix,
     where_figure,
 )
+from ident.units import parameter_unit, torque_unit, unit_suffix
 from ident.verdict import Diagnosis, FrfView, Value
 
 MAX_FRFS = 3
@@ -38,6 +38,7 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         unit=parameter_unit,
         rounded=rounded,
         unit_suffix=unit_suffix,
+        torque_unit=torque_unit(diagnosis.robot),
         table=parameter_table(diagnosis.verdict.baseline),
         grid=[(view.operating_point, frf_grid_figure(view, joints)) for view in _worst(diagnosis.frf)[:1]],
         frfs=[(view.operating_point, frf_figure(view, joints)) for view in diagnosis.frf[:MAX_FRFS]],

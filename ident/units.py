@@ -1,0 +1,62 @@
+"""Units of parameters, at rotary and at linear joints."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from ident.graybox import INERTIAL
+from robot_assets.robot import Robot, linear_joints
+
+LINEAR_UNITS = {
+    "N m": "N",
+    "N m/rad": "N/m",
+    "N m/rad2": "N/m2",
+    "N m/rad3": "N/m3",
+    "N m s/rad": "N s/m",
+    "kg m2": "kg",
+    "rad": "m",
+    "rad/s": "m/s",
+}
+"""Units of a linear joint for those of a rotary one."""
+
+KIND_UNITS = {
+    "stiffness": "N m/rad",
+    "damping": "N m s/rad",
+    "motor_inertia": "kg m2",
+    "viscous_friction": "N m s/rad",
+    "torque_offset": "N m",
+    "link_friction": "N m s/rad",
+}
+"""Units of the parameters of rotary joints by kind."""
+
+
+def linear_names(robot: Robot) -> frozenset[str]:
+    """Names of the linear joints."""
+    return frozenset(n for n, linear in zip(robot.joint_names, linear_joints(robot), strict=True) if linear)
+
+
+def unit_at(unit: str, linear: bool) -> str:
+    """A unit of a rotary joint as it is at a joint that may be linear."""
+    return LINEAR_UNITS.get(unit, unit) if linear else unit
+
+
+def parameter_unit(name: str, linear: Collection[str] = ()) -> str:
+    """SI unit of a parameter named by ``graybox.parameter_names`` or of a kind in ``INERTIAL`` or ``KIND_UNITS``.
+
+    Args:
+        linear: names of the linear joints.
+    """
+    kind, _, place = name.partition(".")
+    if kind in INERTIAL:
+        return "kg" if kind == "mass" else "kg m" if kind.startswith("first") else "kg m2"
+    return unit_at(KIND_UNITS[kind], place in linear)
+
+
+def torque_unit(robot: Robot) -> str:
+    """Unit of torques over all joints: those of linear joints alone are forces."""
+    return "N" if len(linear_names(robot)) == robot.n else "N m"
+
+
+def unit_suffix(unit: str) -> str:
+    """The unit behind a number; nothing behind a pure one."""
+    return "" if unit in ("", "1") else f" {unit}"
