@@ -19,7 +19,7 @@ from ident.convert import convert_logs
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
 from ident.show.figures import trace_figure
-from ident.units import torque_unit, unit_suffix
+from ident.units import torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis
 
 COLOURS = (
@@ -137,7 +137,7 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
     for trace in result.traces[: int(machine.picture)]:
         picture = PAGE.parent / f"{machine.folder}.svg"
         # The figures of the report take their colours from its page.
-        svg = trace_figure(trace, result.joints).replace('version="1.1">', f'version="1.1">{COLOURS}', 1)
+        svg = trace_figure(trace, result.joints, torque_units(result.robot)).replace('version="1.1">', f'version="1.1">{COLOURS}', 1)
         picture.write_text(svg, encoding="utf-8")
         lines += [f"![Error of the torque on held-out motion, before and after]({picture.name})", ""]
     lines += [f"{seconds:.0f} s with `--max-causes {machine.max_causes}`.", ""]

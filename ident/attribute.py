@@ -258,7 +258,7 @@ def pruned(problem: Problem, current: Fit) -> Fit:
         h = effect.hypothesis
         own = [(q, v, std[f"{h.effect}@{h.place}:{q.name}"]) for q, v in zip(h.parameters, effect.p, strict=True) if not q.nuisance]
         off = [abs(q.to_internal(v) - q.to_internal(q.null)) / s for q, v, s in own if q.null is not None]
-        # A wave that is not there may still have a length.
+        # The wave number of a wave that is not there may look sure.
         wave = is_wave(h.parameters)
         sizes = [s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in own if q.null is None and (not wave or q.name in WAVE)]
         return all(sizes) if sizes else all(x < ABSENT for x in off)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ident.baseline import UNDETERMINED
 from ident.dataset import Dataset
 from ident.evidence import Candidate, pointless
 from ident.extended import Effect, Prediction, is_along_record
-from ident.graybox import INERTIAL
+from ident.graybox import INERTIAL, Structure
 from ident.hypotheses import Hypothesis
 from ident.link_sensor import LinkDelay
 from ident.next_experiment import NextExperiment, advice
@@ -30,7 +30,7 @@ from ident.trust import (
     shadowed,
     too_fast,
 )
-from ident.units import linear_names, parameter_unit, unit_at
+from ident.units import linear_names, parameter_unit, text_at, unit_at
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 AXIS_STEP = 1e-6  # of a tilt
@@ -87,7 +87,8 @@ def conclude(
         if pointless(effect) or too_fast(problem, last, effect) or shadowed(found, result.rounds):
             trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
-    direct = [_rounded(x, dataset.joints[x.joint]) for x in steps]
+    linear = linear_names(dataset.robot)
+    direct = [_rounded(x, dataset.joints[x.joint], linear) for x in steps]
     direct += [_late(x, dataset.joints[x.joint]) for x in late]
     causes += direct
     detected = result.detected or bool(direct)
@@ -120,7 +121,7 @@ def conclude(
         residual_description=description,
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
-            *(nameless_note(e) for e in final.model.effects if e.hypothesis.decoy),
+            *(nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy),
             *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
         ),
     )
@@ -153,10 +154,18 @@ def inertia_values(rigid: RigidFit) -> dict[str, Value]:
     return out
 
 
-def nameless_note(effect: Effect) -> str:
+def nameless_note(effect: Effect, structure: Structure) -> str:
     """What a model was extended by that is no effect of the catalogue, in a sentence."""
     h = effect.hypothesis
-    return h.sentence.format(joint=h.place, **{q.name: v for q, v in zip(h.parameters, effect.p, strict=True)})
+    numbers = {q.name: v for q, v in zip(h.parameters, effect.p, strict=True)}
+    return text_at(h.sentence, at_linear_joint(effect, structure)).format(joint=h.place, **numbers)
+
+
+def at_linear_joint(effect: Effect, structure: Structure) -> bool:
+    """Whether the parameters of an effect are those of a linear joint."""
+    h = effect.hypothesis
+    of_joint = h.channel != "model" or bool(h.options.get("baseline"))
+    return of_joint and h.place in linear_names(structure.robot)
 
 
 def record_note(effect: Effect) -> str:
@@ -176,14 +185,15 @@ def inertia_note(rigid: RigidFit, baseline: Fit, result: Attribution) -> str:
     )
 
 
-def _rounded(steps: Steps, joint: str) -> Cause:
+def _rounded(steps: Steps, joint: str, linear: Collection[str]) -> Cause:
     """The cause of a position that comes in steps: seen in the samples, not weighed against others."""
+    unit = unit_at("rad", joint in linear)
     return Cause(
         effect="encoder_quantization",
         joint=joint,
-        parameters={"resolution": Value(steps.resolution, steps.std, "rad")},
+        parameters={"resolution": Value(steps.resolution, steps.std, unit)},
         probability=0.99,
-        evidence=f"The position of {joint} takes steps of {steps.resolution:.3g} rad: its samples lie on a grid.",
+        evidence=f"The position of {joint} takes steps of {steps.resolution:.3g} {unit}: its samples lie on a grid.",
         alternatives=(),
     )
 
@@ -220,7 +230,7 @@ def _cause(
         joint=h.place,
         parameters=parameters,
         probability=float(np.clip(own * trust, 0.0, 0.999)),
-        evidence=h.sentence.format(joint=h.place, **numbers),
+        evidence=text_at(h.sentence, at_linear_joint(effect, final.model.structure)).format(joint=h.place, **numbers),
         alternatives=tuple(
             Alternative(e, p, float(v * trust)) for (e, p), v in sorted(others.items(), key=lambda x: -x[1])
         ),
@@ -232,7 +242,7 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
     """Parameters under their catalogue names, SI, with standard deviations."""
     h = effect.hypothesis
     index = {name: i for i, name in enumerate(final.names)}
-    linear = h.channel != "model" and h.place in linear_names(final.model.structure.robot)
+    linear = at_linear_joint(effect, final.model.structure)
     out: dict[str, Value] = {}
     std = {}
     for q, v in zip(h.parameters, effect.p, strict=True):

@@ -38,6 +38,7 @@ from ident.search import NOT_COMPUTED
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, Problem, data_count, fit, predictions
 from ident.trust import LEFT_ERROR, known_probability
+from ident.units import torque_unit
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 from robot_assets.errors import DataError
 
@@ -245,7 +246,7 @@ def diagnose_fully(
         names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
         notes.append(
             f"Taken back: {names}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
-            f" {gain.before:.3g} N m."
+            f" {gain.before:.3g} {torque_unit(dataset.robot)}."
         )
         result, rigid = replace(result, rounds=(), final=baseline, unknown=True), None
         gain, shown, pairs = tested(result)

@@ -19,7 +19,7 @@ MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may 
 STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
 POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found absent
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
-WAVE = "sine", "cosine"  # parameters of an effect that repeats along its variable
+WAVE = "sine", "cosine"  # amplitudes of an effect that repeats along its variable
 RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
 
 
@@ -139,5 +139,5 @@ def pointless(effect: Effect) -> bool:
 
 
 def is_wave(parameters: Sequence[Parameter]) -> bool:
-    """Whether parameters are those of a wave: its two amplitudes, and where they are seen."""
+    """Whether parameters are those of a wave, with its two amplitudes."""
     return set(WAVE) <= {q.name for q in parameters}

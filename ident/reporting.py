@@ -13,8 +13,10 @@ from ident.extended import Effect, Model, Prediction, predict
 from ident.frf import estimate_frf
 from ident.records import Group
 from ident.torque_fit import Fit, Problem, noise_covariance, output_error, residual
+from ident.units import text_at
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
 from robot_assets.errors import DataError
+from robot_assets.robot import linear_joints
 
 BANDS = 8
 SHOWN_SECONDS = 6.0
@@ -194,9 +196,10 @@ def evidence_plot(
     label = LABELS.get(h.variable, "fitted effect, N m")
     if h.variable in ("posture", "frequency"):
         label = "torque of the fitted effect, N m"
-    joint = problem.structure.robot.joint_names[j]
+    joint, linear = problem.structure.robot.joint_names[j], linear_joints(problem.structure.robot)[j]
     shown = f"link encoder of {joint} beside the model, rad" if by_link else f"residual torque of {joint}, N m"
-    return EvidencePlot(cause, f"{h.effect.replace('_', ' ')} at {h.place}", label, shown, x, y, x[order], m[order])
+    title = f"{h.effect.replace('_', ' ')} at {h.place}"
+    return EvidencePlot(cause, title, text_at(label, linear), text_at(shown, linear), x, y, x[order], m[order])
 
 
 def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -31,12 +32,12 @@ from ident.torque_fit import (
 )
 
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain where the baseline is hopeless
-FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched by linear steps alone
+FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched from linear steps that keep the data
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
-STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit goes on to the next ones
+STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit ends: the winner is fitted to the end
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
@@ -219,7 +220,8 @@ def explore(
 
     def started(score: Score) -> Fit | None:
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
-        if stage.chi2_per_dof <= FAINT and misled(problem, stage, model):
+        # A hinge that stands anywhere begins off the data.
+        if stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options and misled(problem, stage, model):
             return None
         return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
 
@@ -244,7 +246,7 @@ def misled(problem: Problem, stage: Fit, model: Model) -> bool:
     """Whether a model has lost the data that the one which it was made of follows: a step that was not linear."""
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            preds = predictions(problem, model, stage.remainders)
+            preds = predictions(problem, revived(problem, model), stage.remainders, steps=1)
     except NOT_COMPUTED:
         return True
     return not np.sum(joint_costs(problem, preds, stage.weights)) <= STRONG * stage.count
@@ -368,8 +370,9 @@ def beside_strong(
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
     strong += workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
-    whole = [r for h, r in (*strong, *ranked) if not is_along_record(h)]
-    strong = [(h, r) for h, r in strong if not (is_along_record(h) and any(matched(problem, h.joint, r, w) for w in whole))]
+    if any(is_along_record(h) for h, _ in strong):
+        whole = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
+        strong = [(h, r) for h, r in strong if not (is_along_record(h) and matched(problem, h.joint, r, whole))]
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
     best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
@@ -398,19 +401,30 @@ def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely
     ]
 
 
-def matched(problem: Problem, joint: int, along: Fit, other: Fit) -> bool:
+def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> bool:
     """Whether a model that is predicted whole leaves noise at a joint, or about what one along the record leaves.
 
-    Noise along the record is taken large for all joints, which flatters what it is compared with, most of all where
+    Noise along the record is taken large for all joints, which flatters the model that it is taken for, most of all where
     another cause is missing. Both are seen in that noise, each less what its own noise is in those units.
+
+    Args:
+        whole: fits of models that are predicted whole, each under the noise that it sees itself.
     """
-    if other.costs[joint] <= DETECTION_EXCESS * other.counts[joint]:
+    if not whole:
+        return False
+    best = min(whole, key=lambda r: r.costs[joint])
+    if best.costs[joint] <= DETECTION_EXCESS * best.counts[joint]:
         return True
     left = max(along.costs[joint] - along.counts[joint], 0.0)
-    preds = predictions(problem, other.model, other.remainders)
-    cost = joint_costs(problem, preds, along.weights)[joint]
-    noise = along.counts[joint] * relative_noise(problem, other.weights, along.weights)[joint]
+    cost = reweighted(problem, best, along.weights).costs[joint]
+    noise = best.counts[joint] * relative_noise(problem, best.weights, along.weights)[joint]
     return bool(left >= CLEARLY_BETTER * (cost - noise))
+
+
+def under_own_noise(problem: Problem, result: Fit) -> Fit:
+    """A fit as it stands, its cost under the noise that its own model sees."""
+    preds = predictions(problem, result.model, result.remainders)
+    return reweighted(problem, result, make_weights(problem, preds, 0.0))
 
 
 def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:

@@ -640,7 +640,8 @@ def relative_noise(problem: Problem, own: Weights, other: Weights) -> np.ndarray
         total = np.zeros(problem.structure.n)
         for group, whiten, covariance in zip(problem.groups, weights.whiten, own.covariance, strict=True):
             spread = np.matmul(whiten, np.linalg.cholesky(covariance))
-            each = len(group.segments) * np.sum(np.abs(spread) ** 2, axis=(0, 2))
+            share = 1.0 if group.window is None else float(np.mean(group.window**2))
+            each = share * len(group.segments) * np.sum(np.abs(spread) ** 2, axis=(0, 2))
             total += each[: len(total)]
             total[list(group.links)] += each[len(total) :]
         return total

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 
 from ident.graybox import INERTIAL
@@ -30,6 +31,9 @@ KIND_UNITS = {
 """Units of the parameters of rotary joints by kind."""
 
 
+_AFTER_A_NUMBER = re.compile(r"(?<= )(?:N m s/rad|N m/rad[23]?|N m|rad/s|rad)(?![\w/])")
+
+
 def linear_names(robot: Robot) -> frozenset[str]:
     """Names of the linear joints."""
     return frozenset(n for n, linear in zip(robot.joint_names, linear_joints(robot), strict=True) if linear)
@@ -38,6 +42,11 @@ def linear_names(robot: Robot) -> frozenset[str]:
 def unit_at(unit: str, linear: bool) -> str:
     """A unit of a rotary joint as it is at a joint that may be linear."""
     return LINEAR_UNITS.get(unit, unit) if linear else unit
+
+
+def text_at(text: str, linear: bool) -> str:
+    """A sentence with units of a rotary joint in it, as it is at a joint that may be linear."""
+    return _AFTER_A_NUMBER.sub(lambda unit: LINEAR_UNITS[unit.group()], text) if linear else text
 
 
 def parameter_unit(name: str, linear: Collection[str] = ()) -> str:
@@ -50,6 +59,16 @@ def parameter_unit(name: str, linear: Collection[str] = ()) -> str:
     if kind in INERTIAL:
         return "kg" if kind == "mass" else "kg m" if kind.startswith("first") else "kg m2"
     return unit_at(KIND_UNITS[kind], place in linear)
+
+
+def torque_units(robot: Robot) -> tuple[str, ...]:
+    """Units of the torques of the joints."""
+    return tuple(unit_at("N m", linear) for linear in linear_joints(robot))
+
+
+def response_unit(robot: Robot) -> str:
+    """Unit of frequency responses from torque to acceleration over all joints."""
+    return "(m/s²)/N" if torque_unit(robot) == "N" else "(rad/s²)/(N m)"
 
 
 def torque_unit(robot: Robot) -> str:

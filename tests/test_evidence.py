@@ -23,6 +23,7 @@ from ident.torque_fit import (
     Weights,
     inverse,
     joint_costs,
+    make_weights,
     predictions,
     relative_noise,
     weighted_cost,
@@ -309,8 +310,8 @@ def test_noise_under_other_weights_is_that_of_its_draws(identified):
     """The closed form against draws of the noise, which is correlated between joints, under weights of another model."""
     _, setup, result = identified
     problem, rng = setup.problem, np.random.default_rng(3)
-    own, stiff = result.weights, polish(setup.problem, replace(result, model=replace(result.model, par=setup.problem.nominal))).weights
-    other = scaled(stiff, 3.0)
+    nominal = predictions(problem, replace(result.model, par=problem.nominal), result.remainders)
+    own, other = result.weights, scaled(make_weights(problem, nominal, 0.0), 3.0)
     assert relative_noise(problem, own, own) == pytest.approx(1.0)
     assert relative_noise(problem, own, scaled(own, 3.0)) == pytest.approx(1.0 / 9.0)
     drawn = np.zeros((2, problem.structure.n))
@@ -334,19 +335,20 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     loud = scaled(result.weights, 10.0)
     flattered = replace(result, weights=loud, costs=joint_costs(problem, predictions(problem, result.model, result.remainders), loud))
     assert wrong.costs[joint] > 2.0 * wrong.counts[joint] > flattered.costs[joint]
-    assert matched(problem, joint, flattered, result)
-    assert not matched(problem, joint, flattered, wrong)
+    assert matched(problem, joint, flattered, [wrong, result])
+    assert not matched(problem, joint, flattered, [wrong]) and not matched(problem, joint, flattered, [])
     # The same error in noise so large that it hides it is not less of an error.
     hidden = replace(wrong, weights=loud, costs=wrong.counts + 0.01 * (wrong.costs - wrong.counts))
-    assert matched(problem, joint, hidden, wrong)
+    assert matched(problem, joint, hidden, [wrong])
 
 
 def test_a_start_that_loses_the_data_is_told_from_one_that_does_not(identified, named):
     _, setup, result = identified
     rub = named["coulomb_friction", "elbow_joint"]
-    small, large = (replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3])),)) for t in (1e-3, 50.0))
+    small, large, none = (replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3])),)) for t in (1e-3, 50.0, np.nan))
     assert not misled(setup.problem, result, small)
     assert misled(setup.problem, result, large)
+    assert misled(setup.problem, result, none)
 
 
 def test_an_effect_that_the_data_need_stays(ur10, tmp_path):

@@ -2,14 +2,30 @@
 
 import pytest
 
-from ident.units import KIND_UNITS, LINEAR_UNITS, linear_names, parameter_unit, torque_unit, unit_at, unit_suffix
+from ident.conclude import at_linear_joint
+from ident.extended import Effect
+from ident.graybox import build_structure
+from ident.hypotheses import catalogue
+from ident.units import (
+    KIND_UNITS,
+    LINEAR_UNITS,
+    linear_names,
+    parameter_unit,
+    response_unit,
+    text_at,
+    torque_unit,
+    torque_units,
+    unit_at,
+    unit_suffix,
+)
 from robot_assets.robot import load_robot
 
 
 def test_a_linear_drive_has_forces_and_metres():
     slide = load_robot("emps")
     (axis,) = slide.joint_names
-    assert torque_unit(slide) == "N" and linear_names(slide) == {axis}
+    assert torque_unit(slide) == "N" and torque_units(slide) == ("N",) and linear_names(slide) == {axis}
+    assert response_unit(slide) == "(m/s²)/N"
     assert parameter_unit(f"stiffness.{axis}", linear_names(slide)) == "N/m"
     assert parameter_unit(f"motor_inertia.{axis}", linear_names(slide)) == "kg"
 
@@ -28,6 +44,27 @@ def test_what_has_no_angle_in_it_is_the_same_at_both(unit):
 
 def test_no_parameter_of_a_drive_at_a_linear_joint_is_told_per_radian():
     assert all("rad" not in LINEAR_UNITS[unit] for unit in KIND_UNITS.values())
+
+
+def test_no_effect_of_a_linear_joint_is_told_in_radians():
+    """Numbers and sentences of the whole catalogue at a linear drive; hinges that may hide there turn."""
+    structure = build_structure(load_robot("emps"))
+    (axis,) = structure.robot.joint_names
+    told = 0
+    for h in catalogue(structure):
+        if h.place != axis or not at_linear_joint(Effect(h, None), structure):
+            continue
+        assert all("rad" not in unit_at(q.unit, True) for q in h.parameters), h.key
+        said = text_at(h.sentence, True)
+        assert " rad" not in said and "N m" not in said, said
+        told += 1
+    assert told > 20
+
+
+def test_a_sentence_of_a_rotary_joint_stays():
+    text = "friction of 3.2 N m beyond 1e-3 rad/s, 5 N m/rad2 and 2 rad."
+    assert text_at(text, False) == text
+    assert text_at(text, True) == "friction of 3.2 N beyond 1e-3 m/s, 5 N/m2 and 2 m."
 
 
 def test_a_pure_number_has_no_unit_behind_it():

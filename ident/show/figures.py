@@ -99,7 +99,7 @@ def _legend(fig, ax) -> None:
     fig.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8, markerscale=3)
 
 
-def frf_figure(view: FrfView, joints: tuple[str, ...]) -> str:
+def frf_figure(view: FrfView, joints: tuple[str, ...], unit: str) -> str:
     """Gain of the diagonal entries of one operating point."""
     n = len(joints)
     columns = min(n, 3)
@@ -114,12 +114,12 @@ def frf_figure(view: FrfView, joints: tuple[str, ...]) -> str:
             _draw_response(ax, view, j, j, 4.0)
             ax.set_title(joints[j], fontsize=8)
         fig.supxlabel("frequency, Hz", fontsize=8)
-        fig.supylabel("(rad/s²)/(N m)", fontsize=8)
+        fig.supylabel(unit, fontsize=8)
         _legend(fig, axes[0][0])
         return _svg(fig)
 
 
-def frf_picture(view: FrfView, joints: tuple[str, ...], shown: list[str]) -> bytes:
+def frf_picture(view: FrfView, joints: tuple[str, ...], shown: list[str], unit: str) -> bytes:
     """Diagonal entries of some joints as PNG on black, for the recording."""
     style = {key: DARK.get(value, value) for key, value in STYLE.items()}
     with mpl.rc_context(style | {"font.size": 9}):
@@ -129,7 +129,7 @@ def frf_picture(view: FrfView, joints: tuple[str, ...], shown: list[str]) -> byt
             _draw_response(ax, view, j, j, 4.0, DARK)
             ax.set_title(name, fontsize=9)
             ax.set_xlabel("frequency, Hz")
-        axes[0][0].set_ylabel("(rad/s²)/(N m)")
+        axes[0][0].set_ylabel(unit)
         _legend(fig, axes[0][0])
         buffer = io.BytesIO()
         fig.savefig(buffer, format="png", dpi=150, facecolor="#0d0d0d")
@@ -153,7 +153,7 @@ def frf_grid_figure(view: FrfView, joints: tuple[str, ...]) -> str:
         return _svg(fig)
 
 
-def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...]) -> str:
+def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...], unit: str) -> str:
     """Residual over noise by operating point, joint and band, before and after; and the noise."""
     with mpl.rc_context(STYLE | {"axes.grid": False, "axes.spines.left": False, "axes.spines.bottom": False}):
         points, edges = spectrum.operating_points, spectrum.band_edges_hz
@@ -165,7 +165,7 @@ def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...]) -> str:
         panels = (
             ("baseline: residual ÷ noise", spectrum.before / noise, ratio),
             ("extended: residual ÷ noise", spectrum.after / noise, ratio),
-            ("noise, N m", noise, {"norm": LogNorm(), "cmap": "GnBu"}),
+            (f"noise, {unit}", noise, {"norm": LogNorm(), "cmap": "GnBu"}),
         )
         images = []
         for ax, (title, data, options) in zip(axes, panels, strict=True):
@@ -197,7 +197,7 @@ def evidence_figure(plot: EvidencePlot) -> str:
         return _svg(fig)
 
 
-def trace_figure(trace: TorqueTrace, joints: tuple[str, ...]) -> str:
+def trace_figure(trace: TorqueTrace, joints: tuple[str, ...], units: tuple[str, ...]) -> str:
     """Torque errors of both models in time on one held-out segment, worst three joints."""
     before = (trace.measured - trace.before).std(axis=0)
     scale = np.maximum(trace.measured.std(axis=0), 1e-9)
@@ -210,7 +210,7 @@ def trace_figure(trace: TorqueTrace, joints: tuple[str, ...]) -> str:
             ax.plot(t, (trace.measured - trace.before)[::step, j], color=BEFORE, lw=0.7, label="error of the baseline")
             ax.plot(t, (trace.measured - trace.after)[::step, j], color=AFTER, lw=0.7, label="error of the extended model")
             ax.set_title(joints[j], fontsize=8, loc="left")
-            ax.set_ylabel("N m")
+            ax.set_ylabel(units[j])
             ax.margins(x=0)
         _legend(fig, axes[0][0])
         axes[-1][0].set_xlabel("time, s")

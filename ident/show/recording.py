@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from ident.graybox import build_structure
 from ident.show.figures import frf_picture, rounded
-from ident.units import torque_unit, unit_suffix
+from ident.units import response_unit, torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis, TorqueTrace
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
@@ -44,7 +44,7 @@ def write_recording(diagnosis: Diagnosis, path: Path) -> None:
         _log_torques(stream, trace, diagnosis.joints)
         _log_arm(stream, diagnosis, trace)
     for view in diagnosis.frf[:1]:
-        picture = frf_picture(view, diagnosis.joints, _worst_joints(diagnosis)[:2])
+        picture = frf_picture(view, diagnosis.joints, _worst_joints(diagnosis)[:2], response_unit(diagnosis.robot))
         stream.log("frf", rr.EncodedImage(contents=picture, media_type="image/png"), static=True)
     stream.flush()
     stream.disconnect()
@@ -52,8 +52,9 @@ def write_recording(diagnosis: Diagnosis, path: Path) -> None:
 
 def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     joints = _worst_joints(diagnosis)
-    torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, N m")]
-    torques += [rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, N m") for name in joints]
+    unit = dict(zip(diagnosis.joints, torque_units(diagnosis.robot), strict=True))
+    torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, {unit[joints[0]]}")]
+    torques += [rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, {unit[name]}") for name in joints]
     responses = [
         rrb.Spatial2DView(origin="frf", name=f"FRF at {view.operating_point}") for view in diagnosis.frf[:1]
     ]

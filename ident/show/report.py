@@ -16,7 +16,7 @@ from ident.show.figures import (
     trace_figure,
     where_figure,
 )
-from ident.units import parameter_unit, torque_unit, unit_suffix
+from ident.units import parameter_unit, response_unit, torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis, FrfView, Value
 
 MAX_FRFS = 3
@@ -29,7 +29,7 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=select_autoescape(["j2", "html"])
     )
-    joints = diagnosis.joints
+    joints, robot = diagnosis.joints, diagnosis.robot
     html = environment.get_template("report.html.j2").render(
         d=diagnosis,
         v=diagnosis.verdict,
@@ -38,13 +38,14 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         unit=parameter_unit,
         rounded=rounded,
         unit_suffix=unit_suffix,
-        torque_unit=torque_unit(diagnosis.robot),
+        torque_unit=torque_unit(robot),
+        response_unit=response_unit(robot),
         table=parameter_table(diagnosis.verdict.baseline),
         grid=[(view.operating_point, frf_grid_figure(view, joints)) for view in _worst(diagnosis.frf)[:1]],
-        frfs=[(view.operating_point, frf_figure(view, joints)) for view in diagnosis.frf[:MAX_FRFS]],
-        where=where_figure(diagnosis.spectrum, joints) if diagnosis.spectrum else None,
+        frfs=[(view.operating_point, frf_figure(view, joints, response_unit(robot))) for view in diagnosis.frf[:MAX_FRFS]],
+        where=where_figure(diagnosis.spectrum, joints, torque_unit(robot)) if diagnosis.spectrum else None,
         evidence={p.cause: evidence_figure(p) for p in diagnosis.evidence},
-        traces=[(t.segment, trace_figure(t, joints)) for t in diagnosis.traces[:MAX_TRACES]],
+        traces=[(t.segment, trace_figure(t, joints, torque_units(robot))) for t in diagnosis.traces[:MAX_TRACES]],
     )
     path.write_text(html, encoding="utf-8")
 
