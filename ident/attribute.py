@@ -9,7 +9,7 @@ from all of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -120,7 +120,7 @@ def attribute(
         bare = np.inf if rounds else worth_a_hinge(current)
         found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current), bare)
         if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
-            found = attribute_once(problem, current, hypotheses, workers, 0.0, bare)
+            found = beside_unclear(problem, current, found, hypotheses, workers, bare)
         if not answers(found):
             break
         found = with_name(found)
@@ -430,6 +430,36 @@ def attribute_once(
     allowed = DETECTION_EXCESS - 1.0 if spoilt else FAINT
     if min(before.chi2_per_dof - 1.0, left_by(ranked) / before.count) > allowed and not workers.late:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
+    return weighed_round(before, ranked, scores, softly)
+
+
+def beside_unclear(
+    problem: Problem, current: Fit, found: Round, hypotheses: Sequence[Hypothesis], workers: Workers, bare: float
+) -> Round:
+    """A round in which nothing answers, with candidates of which a linear step has shown too little to try them.
+
+    Args:
+        bare: as of ``search.explore``.
+    """
+    direct, scores = explore(problem, current, hypotheses, 0.0, bare, workers)
+    hopefuls = [(h, r) for h, r in direct if not pointless(r.model.effects[-1])][:FINALISTS]
+    same = workers.map(lambda x: refit(problem, x[1].model, found.before.weights, x[1].remainders), hopefuls)
+    known = [(c.hypothesis, c.fit) for c in found.candidates]
+    new = [(h, r) for (h, _), r in zip(hopefuls, same, strict=True) if r is not None and all(h is not k for k, _ in known)]
+    if not new:
+        return found
+    before, ranked = under_noise_of_best(problem, found.before, sorted(known + new, key=lambda x: x[1].cost), workers)
+    return weighed_round(before, ranked, scores, {})
+
+
+def weighed_round(
+    before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]], scores: Sequence[Score], softly: Mapping[tuple[str, str], float]
+) -> Round:
+    """Candidates weighed by their evidence.
+
+    Args:
+        softly: what hypotheses explain under softened weights, by ``key``.
+    """
     if not ranked:
         return Round(before, (), tuple(scores), 1.0, 0.0)
     rivals, excess = rivals_of_best(before, ranked)
