@@ -89,7 +89,7 @@ class Prediction:
         """(S, L, n + M) predicted recorded torque, N m, and link positions, rad, as ``Group.outputs``."""
         if not group.links:
             return self.U
-        return np.concatenate([self.U, self.solution.Q_a[..., self.structure.driven[list(group.links)]]], axis=-1)
+        return np.concatenate([self.U, self.solution.Q_driven[..., list(group.links)]], axis=-1)
 
     @cached_property
     def sampled_impedance(self) -> np.ndarray:
@@ -212,7 +212,7 @@ def predict_at(
         by_channel.setdefault(effect.hypothesis.channel, []).append(effect)
     for effect in by_channel.get("position", []):
         j = effect.hypothesis.joint
-        bare = Solution(Q, Q, Q, Q, Q, Q, Torques())
+        bare = Solution(Q, Q, Q, Q, Q, Q, Q, Torques())
         Q = Q.copy()
         Q[..., j] += effect.hypothesis.law(effect.p, Motion(group, bare, par), j, par.stiffness[j])
     inner = by_channel.get("link", []) + by_channel.get("spring", [])
@@ -280,8 +280,7 @@ def _inner_torques(
             at_gear[j] = at_gear.get(j, 0.0) + plane.C[:, j] * motion.lines(error)
             motor[..., j] += motion.lines(torque)
         else:
-            view = _link_view(motion, j, structure.driven[j])
-            at_link[j] = at_link.get(j, 0.0) + motion.lines(h.law(effect.p, view, j, par.stiffness[j]))
+            at_link[j] = at_link.get(j, 0.0) + motion.lines(h.law(effect.p, motion, j, par.stiffness[j]))
     at_motors = _motor_torques(par, motion, motors) if motors else 0.0
     old_gear = solution.torques.spring + np.zeros((S, L, n), complex)
     old_link = solution.torques.link + np.zeros((S, L, structure.n_coordinates), complex)
@@ -292,7 +291,7 @@ def _inner_torques(
         if effect.hypothesis.channel == "link":
             others = at_link.get(j, 0.0)
             guess = old_link[..., c] - others
-            at_link[j] = others + _loop(effect.hypothesis.options["loop"](effect.p), grid, solution.Q_a[..., c] + compliance * guess, modes, guess)
+            at_link[j] = others + _loop(effect.hypothesis.options["loop"](effect.p), grid, solution.Q_driven[..., j] + compliance * guess, modes, guess)
         else:
             others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
@@ -444,12 +443,3 @@ def _loop(
     rate = grid.to_time((1j * grid.omega * free)[..., None])[..., 0] if law.code == kernels.LINK else x
     start = modal_state(guess, grid.omega, grid.period_time / grid.n_time, modes)
     return grid.to_lines(steady_loop(law, x, rate, modes, start)[..., None])[..., 0]
-
-
-def _link_view(motion: Motion, joint: int, column: int) -> Motion:
-    """The motion with link coordinate ``joint`` moved to where laws look for it."""
-    if joint == column:
-        return motion
-    Q_a = motion.solution.Q_a.copy()
-    Q_a[..., joint] = motion.solution.Q_a[..., column]
-    return replace(motion, solution=replace(motion.solution, Q_a=Q_a))

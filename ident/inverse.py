@@ -137,10 +137,14 @@ class Torques:
 
 @dataclass(frozen=True)
 class Solution:
-    """A prediction and its parts; spectra of (S, L, .)."""
+    """A prediction and its parts; spectra of (S, L, .).
+
+    ``Q_a`` holds all coordinates of the links, ``Q_driven`` those that the joints drive, in their order.
+    """
 
     Q: np.ndarray
     Q_a: np.ndarray
+    Q_driven: np.ndarray
     delta: np.ndarray
     tau_s: np.ndarray
     U: np.ndarray
@@ -184,13 +188,13 @@ class Motion:
         """Torque that the gear carries, N m."""
         return self._time(self.solution.tau_s, joint)
 
-    def q_link(self, coordinate: int) -> np.ndarray:
-        """Link coordinate, rad."""
-        return self._time(self.solution.Q_a, coordinate)
+    def q_link(self, joint: int) -> np.ndarray:
+        """Position of the link behind the gear, rad."""
+        return self._time(self.solution.Q_driven, joint)
 
-    def v_link(self, coordinate: int) -> np.ndarray:
+    def v_link(self, joint: int) -> np.ndarray:
         """Its velocity, rad/s."""
-        return self._time(self.solution.Q_a, coordinate, 1)
+        return self._time(self.solution.Q_driven, joint, 1)
 
     def torque(self, joint: int) -> np.ndarray:
         """Recorded motor torque without lines of noise alone, N m."""
@@ -353,11 +357,12 @@ def _solution(
     structure: Structure, par: Parameters, plane: Plane, Q: np.ndarray, W: np.ndarray, torques: Torques
 ) -> Solution:
     Q_a = link_motion(structure, par, plane, Q, W, torques)
-    delta = Q @ par.coupling.T - Q_a[..., structure.driven]
+    Q_driven = Q_a[..., structure.driven]
+    delta = Q @ par.coupling.T - Q_driven
     tau_s = plane.C * delta + torques.spring
     s = plane.s[:, None]
     U = (s**2 * par.inertia + s * par.viscous) * Q + tau_s @ par.coupling + torques.motor
-    return Solution(Q, Q_a, delta, tau_s, plane.record[:, None] * U, W, torques)
+    return Solution(Q, Q_a, Q_driven, delta, tau_s, plane.record[:, None] * U, W, torques)
 
 
 def baseline_products(

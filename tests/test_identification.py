@@ -13,9 +13,12 @@ from ident.frf import estimate_frf
 from ident.gain import segment_errors
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
+from ident.screening import screen
+from ident.torque_fit import fit, predictions
+from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
-from tests.conftest import small_plan
+from tests.conftest import small_plan, through_files
 
 FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
@@ -107,3 +110,20 @@ def test_a_ripple_that_is_fast_along_a_motion_does_not_fold_into_its_band(ur10):
     (motion,) = (g for g in setup.held_out if g.window is not None)
     errors, _ = segment_errors(setup.problem, (motion,), bare, rippled)
     assert np.sqrt(errors.after[:, 2].mean()) < 0.2 * np.sqrt(errors.before[:, 2].mean())
+
+
+def test_links_behind_gears_are_found_beside_elastic_hinges(tmp_path):
+    """An arm with hinges has more link coordinates than joints: what pulls on a link sees the one that its joint drives."""
+    irb = load_robot("irb")
+    spring = parse_effect("gravity_spring@joint_2:stiffness=900,rest_angle=0.2", irb)
+    data = run_experiment(small_plan(irb, 3, levels=(0.5,), period=1000), [spring], seed=3)
+    problem = set_up(through_files(data, tmp_path)).problem
+    result = fit(problem, Model(problem.structure, problem.nominal))
+    preds = predictions(problem, result.model, result.remainders)
+    for group, pred in zip(problem.groups, preds, strict=True):
+        motion = pred.motion(group)
+        for j in range(irb.n):
+            assert motion.q_link(j) == pytest.approx(motion.q(j) - motion.delta(j), abs=1e-4)
+    best = screen(problem, result, preds, [h for h in catalogue(problem.structure) if h.effect == "gravity_spring"])[0]
+    assert best.hypothesis.place == "joint_2"
+    assert best.start == pytest.approx([900.0, 0.2], rel=0.1)
