@@ -51,7 +51,7 @@ def segment_errors(
             continue
         pairs.append((a, b))
         S = noise_covariance(problem, group, b)
-        share = 1.0 if group.window is None else float(np.mean(group.window**2))
+        share = group.window_share
         noise = share * np.einsum("kii->ki", S).real
         names += [name for name in group.segments for _ in range(parts)]
         for store, pred in ((out[0], a), (out[1], b)):

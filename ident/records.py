@@ -138,6 +138,11 @@ class Group:
         cut = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
         return replace(self, omega=self.omega[: self.n_slow], excited=self.excited[:, : self.n_slow], n_slow=None, **cut)
 
+    @property
+    def window_share(self) -> float:
+        """Share of the power of a record that its window leaves; 1 where there is none."""
+        return 1.0 if self.window is None else float(np.mean(self.window**2))
+
     def to_time(self, X: np.ndarray) -> np.ndarray:
         """Spectrum (..., L, m) on the time grid (..., n_time, m)."""
         return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward")

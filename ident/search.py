@@ -27,8 +27,8 @@ from ident.torque_fit import (
     fit,
     joint_costs,
     make_weights,
+    noise_costs,
     predictions,
-    relative_noise,
 )
 
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain where the baseline is hopeless
@@ -417,7 +417,7 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
         return True
     left = max(along.costs[joint] - along.counts[joint], 0.0)
     cost = reweighted(problem, best, along.weights).costs[joint]
-    noise = best.counts[joint] * relative_noise(problem, best.weights, along.weights)[joint]
+    noise = noise_costs(problem, best.weights, along.weights)[joint]
     return bool(left >= CLEARLY_BETTER * (cost - noise))
 
 

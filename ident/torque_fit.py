@@ -244,13 +244,14 @@ def output_error(group: Group, prediction: Prediction) -> np.ndarray:
 
 def data_counts(problem: Problem) -> np.ndarray:
     """Real numbers that are compared, by joint; (n,)."""
-    total = np.zeros(problem.structure.n)
-    for group in problem.groups:
-        share = 1.0 if group.window is None else float(np.mean(group.window**2))
-        each = share * len(group.segments) * (2 * group.n_compared - 1)
-        total += each
-        total[list(group.links)] += each
-    return total
+    n = problem.structure.n
+    each = [np.full(n + len(g.links), _records(g) * (2 * g.n_compared - 1)) for g in problem.groups]
+    return _by_joint(problem, each)
+
+
+def _records(group: Group) -> float:
+    """Records of a group, those seen through a window as the share that it leaves."""
+    return len(group.segments) * group.window_share
 
 
 def data_count(problem: Problem) -> int:
@@ -625,28 +626,32 @@ def weighted_cost(problem: Problem, preds: Sequence[Prediction], weights: Weight
 
 def joint_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
     """The same by joint, its link encoder included; (n,)."""
+    each = [
+        np.sum(np.abs(weights.apply(g, output_error(group, pred))) ** 2, axis=(0, 1))
+        for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True))
+    ]
+    return _by_joint(problem, each)
+
+
+def noise_costs(problem: Problem, noise: Weights, weights: Weights) -> np.ndarray:
+    """Costs by joint that the noise which some weights stand for is expected to have under others; (n,).
+
+    Under themselves that is ``data_counts``.
+    """
+    each = []
+    for group, covariance, whiten in zip(problem.groups, noise.covariance, weights.whiten, strict=True):
+        spread = np.matmul(whiten, np.linalg.cholesky(covariance))
+        each.append(_records(group) * np.sum(np.abs(spread) ** 2, axis=(0, 2)))
+    return _by_joint(problem, each)
+
+
+def _by_joint(problem: Problem, each: Sequence[np.ndarray]) -> np.ndarray:
+    """Sums over groups of figures of their outputs (n + M,), those of link encoders with their joints; (n,)."""
     total = np.zeros(problem.structure.n)
-    for g, (group, pred) in enumerate(zip(problem.groups, preds, strict=True)):
-        each = np.sum(np.abs(weights.apply(g, output_error(group, pred))) ** 2, axis=(0, 1))
-        total += each[: len(total)]
-        total[list(group.links)] += each[len(total) :]
+    for group, figures in zip(problem.groups, each, strict=True):
+        total += figures[: len(total)]
+        total[list(group.links)] += figures[len(total) :]
     return total
-
-
-def relative_noise(problem: Problem, own: Weights, other: Weights) -> np.ndarray:
-    """Cost that the noise which weights stand for has under others, over that under themselves, by joint; (n,)."""
-
-    def under(weights: Weights) -> np.ndarray:
-        total = np.zeros(problem.structure.n)
-        for group, whiten, covariance in zip(problem.groups, weights.whiten, own.covariance, strict=True):
-            spread = np.matmul(whiten, np.linalg.cholesky(covariance))
-            share = 1.0 if group.window is None else float(np.mean(group.window**2))
-            each = share * len(group.segments) * np.sum(np.abs(spread) ** 2, axis=(0, 2))
-            total += each[: len(total)]
-            total[list(group.links)] += each[len(total) :]
-        return total
-
-    return under(other) / under(own)
 
 
 def _normal(

@@ -21,11 +21,12 @@ from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
     Weights,
+    data_counts,
     inverse,
     joint_costs,
     make_weights,
+    noise_costs,
     predictions,
-    relative_noise,
     weighted_cost,
 )
 from ident.trust import shadowed
@@ -312,8 +313,8 @@ def test_noise_under_other_weights_is_that_of_its_draws(identified):
     problem, rng = setup.problem, np.random.default_rng(3)
     nominal = predictions(problem, replace(result.model, par=problem.nominal), result.remainders)
     own, other = result.weights, scaled(make_weights(problem, nominal, 0.0), 3.0)
-    assert relative_noise(problem, own, own) == pytest.approx(1.0)
-    assert relative_noise(problem, own, scaled(own, 3.0)) == pytest.approx(1.0 / 9.0)
+    assert noise_costs(problem, own, own) == pytest.approx(data_counts(problem))
+    assert noise_costs(problem, own, scaled(own, 3.0)) == pytest.approx(data_counts(problem) / 9.0)
     drawn = np.zeros((2, problem.structure.n))
     for g, group in enumerate(problem.groups):
         root = np.linalg.cholesky(own.covariance[g])
@@ -322,7 +323,7 @@ def test_noise_under_other_weights_is_that_of_its_draws(identified):
             noise = np.matmul(root, white[..., None])[..., 0]
             for i, weights in enumerate((own, other)):
                 drawn[i] += np.sum(np.abs(weights.apply(g, noise)) ** 2, axis=(0, 1))[: problem.structure.n]
-    assert relative_noise(problem, own, other) == pytest.approx(drawn[1] / drawn[0], rel=0.03)
+    assert noise_costs(problem, own, other) / data_counts(problem) == pytest.approx(drawn[1] / drawn[0], rel=0.03)
 
 
 def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named):

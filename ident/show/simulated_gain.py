@@ -91,7 +91,7 @@ def simulated_errors(
     names: list[str] = []
     out: list[list[np.ndarray]] = [[], [], []]
     for group in groups:
-        share = 1.0 if group.window is None else float(np.mean(group.window**2))
+        share = group.window_share
         try:
             needed = [replay(arm, group, problem.sampling).U for arm in arms]
             noise = noise_covariance(problem, group, predict(noise_of, group, problem.sampling))
