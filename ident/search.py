@@ -220,10 +220,11 @@ def explore(
 
     def started(score: Score) -> Fit | None:
         model = replace(stage.model, effects=extended_by(stage.model.effects, score))
-        # A hinge that stands anywhere begins off the data.
-        if stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options and misled(problem, stage, model):
-            return None
-        return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS)
+        # Where the data are followed, a start that has lost them was a step that is not linear. A hinge that stands
+        # anywhere begins off them.
+        followed = stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options
+        most = STRONG * stage.count if followed else np.inf
+        return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most)
 
     def finished(result: Fit) -> Fit:
         return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
@@ -240,16 +241,6 @@ def explore(
         last = workers.map(finished, [r for _, r in found])
         found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores
-
-
-def misled(problem: Problem, stage: Fit, model: Model) -> bool:
-    """Whether a model has lost the data that the one which it was made of follows: a step that was not linear."""
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            preds = predictions(problem, revived(problem, model), stage.remainders, steps=1)
-    except NOT_COMPUTED:
-        return True
-    return not np.sum(joint_costs(problem, preds, stage.weights)) <= STRONG * stage.count
 
 
 def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
@@ -276,11 +267,17 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
 
 
 def refit(
-    problem: Problem, model: Model, weights: Weights, remainders: Sequence[np.ndarray], iterations: int = 10
+    problem: Problem,
+    model: Model,
+    weights: Weights,
+    remainders: Sequence[np.ndarray],
+    iterations: int = 10,
+    most: float = np.inf,
 ) -> Fit | None:
     """A candidate fitted from where screening put it.
 
-    None where its model cannot be computed, or ends where the data feel no change of its last effect.
+    None where its model cannot be computed, costs more than ``most`` at the start, or ends where the data feel no change
+    of its last effect.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
@@ -290,6 +287,7 @@ def refit(
                 iterations=iterations,
                 weights=weights,
                 remainders=remainders,
+                most=most,
             )
     except NOT_COMPUTED:
         return None

@@ -463,6 +463,7 @@ def fit(
     gap: float = GAP,
     weights: Weights | None = None,
     remainders: Sequence[np.ndarray] | None = None,
+    most: float = np.inf,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Fit baseline parameters, timing and effects together.
@@ -476,6 +477,10 @@ def fit(
         gap: relative fall of the cost in a step below which the fit ends.
         weights: those to fit under; of the start where None.
         remainders: geometric remainders to start from.
+        most: cost of the start above which there is no fit.
+
+    Raises:
+        ArithmeticError: where the start costs more.
     """
     limit = TIMING_LIMIT * problem.sampling.sample_time
     m = len(model.par.to_log())
@@ -489,6 +494,8 @@ def fit(
     if weights is None:
         weights = make_weights(problem, preds, rho)
     cost = weighted_cost(problem, preds, weights)
+    if np.isfinite(most) and not cost <= most:
+        raise FloatingPointError(f"a start that costs {cost:.3g}, more than {most:.3g}")
     settled = model, preds, Ws, cost
     if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.

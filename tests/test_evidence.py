@@ -16,7 +16,7 @@ from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.search import matched, misled, polish
+from ident.search import STRONG, matched, polish, refit
 from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
@@ -343,13 +343,18 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     assert matched(problem, joint, hidden, [wrong])
 
 
-def test_a_start_that_loses_the_data_is_told_from_one_that_does_not(identified, named):
+def test_a_start_that_loses_the_data_is_not_followed(identified, named):
     _, setup, result = identified
     rub = named["coulomb_friction", "elbow_joint"]
     small, large, none = (replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3])),)) for t in (1e-3, 50.0, np.nan))
-    assert not misled(setup.problem, result, small)
-    assert misled(setup.problem, result, large)
-    assert misled(setup.problem, result, none)
+
+    def followed(model):
+        return refit(setup.problem, model, result.weights, result.remainders, 1, STRONG * result.count)
+
+    assert followed(small) is not None
+    assert followed(large) is None
+    assert followed(none) is None
+    assert refit(setup.problem, large, result.weights, result.remainders, 1) is not None
 
 
 def test_an_effect_that_the_data_need_stays(ur10, tmp_path):
