@@ -7,6 +7,7 @@ memory, and their inner products are sums over lines of small matrices.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,19 @@ class Columns:
         out[..., self.product_at] = self.products.dense()
         out[..., self.whole_at] = self.whole
         return out
+
+    def replaced(self, columns: Mapping[int, np.ndarray]) -> Columns:
+        """With other columns (S, K, n), or more, by their coordinates."""
+        if not columns:
+            return self
+        new = np.array(list(columns))
+        kept, left = ~np.isin(self.product_at, new), ~np.isin(self.whole_at, new)
+        return Columns(
+            self.products.pick(np.flatnonzero(kept)),
+            self.product_at[kept],
+            np.concatenate([self.whole[..., left], *(x[..., None] for x in columns.values())], axis=-1),
+            np.concatenate([self.whole_at[left], new]),
+        )
 
     def normal(self, whiten: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (p, p) and right-hand side (p,) of real and imaginary parts.

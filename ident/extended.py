@@ -223,18 +223,21 @@ def predict_at(
     passes = 1 if len(inner) == 1 and _closes_itself(inner[0]) else REACTION_STEPS
     start = torques if inner else Torques()
     solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps)
-    U = solution.U
     if motor:
-        U = U + plane.record[:, None] * _motor_torques(par, Motion(group, solution, par), motor)
-        solution = replace(solution, U=U)
-    for effect in by_channel.get("drive", []):
-        j = effect.hypothesis.joint
-        U = U.copy()
-        U[..., j] = effect.hypothesis.law(
-            effect.p, Motion(group, solution, par), j, par.stiffness[j], U[..., j]
-        )
+        at_motors = plane.record[:, None] * _motor_torques(par, Motion(group, solution, par), motor)
+        solution = replace(solution, U=solution.U + at_motors)
+    U = through_drives(by_channel.get("drive", []), Motion(group, solution, par))
     added = _added_stiffness(solution, by_channel.get("spring", []))
     return Prediction(model, sampling, structure, par, plane, solution, U, added)
+
+
+def through_drives(effects: Sequence[Effect], motion: Motion) -> np.ndarray:
+    """(S, L, n) torque of a motion as drives with effects record it, N m."""
+    U = motion.solution.U.copy()
+    for effect in effects:
+        h, j = effect.hypothesis, effect.hypothesis.joint
+        U[..., j] = h.law(effect.p, motion, j, motion.par.stiffness[j], U[..., j])
+    return U
 
 
 def _added_stiffness(solution: Solution, effects: Sequence[Effect]) -> np.ndarray:

@@ -80,6 +80,7 @@ def polish(problem: Problem, result: Fit) -> Fit:
         revived(problem, result.model),
         iterations=POLISH_STEPS,
         remainders=result.remainders,
+        exact=True,
     )
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.columns import Columns
-from ident.extended import Effect, Model, Prediction, beside, joints_along_record, predict, predict_at
+from ident.extended import Effect, Model, Prediction, beside, joints_along_record, predict, predict_at, through_drives
 from ident.graybox import Parameters, Structure, parameter_names
 from ident.inverse import Motion, Sampling, Torques, baseline_products
 from ident.noise import residual_covariance, white_covariance
@@ -24,6 +24,7 @@ from ident.records import Group
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
 PRIOR_TIMING = 0.25  # of the common timing offset, samples
 TIMING_STEP = 1e-6  # s, for differences
+BASELINE_STEP = 1e-3  # of logarithms, for differences
 TIMING_LIMIT = 0.6  # samples
 HELD, HOLD = 0.1, 0.04  # error added to the noise from which drives are held, and how strongly
 ANNEALING = (0.5, 0.1, 0.02, 0.0)
@@ -289,8 +290,13 @@ def unpack(model: Model, x: np.ndarray, limit: float) -> Model:
     return Model(model.structure, par, tuple(effects))
 
 
-def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> Columns:
-    """Derivative of the predicted recorded torque by the fitted coordinates, at the lines that are compared."""
+def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction, *, exact: bool = False) -> Columns:
+    """Derivative of the predicted outputs by the fitted coordinates, at the lines that are compared.
+
+    Args:
+        exact: what moves the links moves the torques of all laws of the gears and the geometric remainder. Both are held
+            without, which beside such laws ends short of the minimum, and tells of less spread than there is.
+    """
     m = len(model.par.to_log())
     top = compared_lines(group)
     n, n_e = model.structure.n, len(model.structure.elastic)
@@ -299,58 +305,50 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction) -> 
     base = baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
     late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
     late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
-    if joints_along_record(model, group):
-        later = replace(model, par=replace(model.par, timing=model.par.timing + TIMING_STEP))
-        late = (predict(later, group, problem.sampling, W=pred.solution.W).U - pred.U)[:, :top] / TIMING_STEP
+    baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
+    baseline = baseline.replaced(_through_drives(baseline, model, group, pred))
+    baseline = baseline.replaced(_differences(problem, model, group, pred, exact))
+    if not problem.free_timing:
+        baseline.whole[..., baseline.whole_at == m] = 0.0
     effects = [
         column[:, :top]
         for i in range(len(model.effects))
-        for column in _effect_columns(problem, model, group, pred, i)
+        for column in _effect_columns(problem, model, group, pred, i, exact)
     ]
-    baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
-    baseline = _through_drives(_beside_gears(problem, model, group, pred, baseline), model, group, pred)
-    if not problem.free_timing:
-        baseline.whole[..., baseline.whole_at == m] = 0.0
-    return replace(
-        baseline,
-        whole=np.concatenate([baseline.whole, *(x[..., None] for x in effects)], axis=-1),
-        whole_at=np.concatenate([baseline.whole_at, m + 1 + np.arange(len(effects))]),
-    )
+    return baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
 
 
-def _beside_gears(
-    problem: Problem, model: Model, group: Group, pred: Prediction, columns: Columns
-) -> Columns:
-    """Baseline columns beside laws of the gear, by differences.
+def _differences(problem: Problem, model: Model, group: Group, pred: Prediction, exact: bool) -> dict[int, np.ndarray]:
+    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` the links, by differences.
 
     These laws move with the gear's spring and damper; and where the recorded torque says its deflection, with what
-    the motor takes of that.
+    the motor takes of that, and with the timing.
     """
-    n = model.structure.n
-    loops = [e.hypothesis for e in model.effects if e.hypothesis.gear_law]
-    moved = []
+    n, m = model.structure.n, len(model.par.to_log())
     along = joints_along_record(model, group)
-    for c in sorted({f * n + h.joint for h in loops for f in range(4 if h.joint in along else 2)}):
-        x = pack(model)
-        x[c] += 1e-3
-        there = predict(unpack(model, x, np.inf), group, problem.sampling, W=pred.solution.W, torques=pred.solution.torques)
-        moved.append((c, (there.outputs(group) - pred.outputs(group))[:, : columns.whole.shape[1]] / 1e-3))
-    if not moved:
-        return columns
-    kept = np.setdiff1d(columns.product_at, [c for c, _ in moved])
-    return Columns(
-        columns.products.pick(kept),
-        kept,
-        np.concatenate([columns.whole, *(x[..., None] for _, x in moved)], axis=-1),
-        np.concatenate([columns.whole_at, [c for c, _ in moved]]),
-    )
+    gears = {e.hypothesis.joint for e in model.effects if e.hypothesis.gear_law}
+    steps = {f * n + j: BASELINE_STEP for j in gears for f in range(4 if j in along else 2)}
+    if exact:
+        steps |= dict.fromkeys(np.flatnonzero(_moves_links(model)[:m]).tolist(), BASELINE_STEP)
+    if along:
+        steps[m] = TIMING_STEP
+    if not steps:
+        return {}
+
+    def outputs(there: Model) -> np.ndarray:
+        held = {"W": pred.solution.W, "torques": pred.solution.torques}
+        return predict(there, group, problem.sampling, **held, steps=int(exact)).outputs(group)[:, : compared_lines(group)]
+
+    now = outputs(model)
+    x = pack(model)
+    return {c: (outputs(unpack(model, x + step * (np.arange(len(x)) == c), np.inf)) - now) / step for c, step in steps.items()}
 
 
-def _through_drives(columns: Columns, model: Model, group: Group, pred: Prediction) -> Columns:
-    """Baseline columns of the torque that drives with effects pass on."""
+def _through_drives(columns: Columns, model: Model, group: Group, pred: Prediction) -> dict[int, np.ndarray]:
+    """Baseline columns of the torque that drives with effects pass on; none where there are no such drives."""
     drives = [e for e in model.effects if e.hypothesis.channel == "drive"]
     if not drives:
-        return columns
+        return {}
     dense = columns.dense()
     for effect in drives:
         j, motion = effect.hypothesis.joint, pred.motion(group)
@@ -358,8 +356,7 @@ def _through_drives(columns: Columns, model: Model, group: Group, pred: Predicti
         full[:, :, : dense.shape[1]] = np.moveaxis(dense[:, :, j], -1, 0)
         passed = _change_passed(effect, motion, full)
         dense[:, :, j] = np.moveaxis(passed[:, :, : dense.shape[1]], 0, -1)
-    none = np.empty(0, int)
-    return Columns(columns.products.pick(none), none, dense, np.arange(dense.shape[-1]))
+    return dict(enumerate(np.moveaxis(dense, -1, 0)))
 
 
 def _change_passed(drive: Effect, motion: Motion, X: np.ndarray) -> np.ndarray:
@@ -374,7 +371,7 @@ def compared_lines(group: Group) -> int:
 
 
 def _effect_columns(
-    problem: Problem, model: Model, group: Group, pred: Prediction, i: int
+    problem: Problem, model: Model, group: Group, pred: Prediction, i: int, exact: bool
 ) -> list[np.ndarray]:
     """Derivatives (S, L, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences."""
     effect = model.effects[i]
@@ -388,14 +385,15 @@ def _effect_columns(
         steps.append((p, step))
     if h.channel == "motor" and not joints_along_record(model, group):
         return _motor_columns(model, group, pred, effect, steps)
+    if h.channel == "drive":
+        return _drive_columns(model, group, pred, effect, steps)
     models = [
         Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
         for p, _ in steps
     ]
     W, sampling = pred.solution.W, problem.sampling
-    if h.channel == "model":
-        base = predict(model, group, sampling, W=W, steps=1)
-        moved = [predict(m, group, sampling, W=W, steps=1) for m in models]
+    if h.channel == "model" or exact:
+        base, *moved = (predict(m, group, sampling, W=W, steps=1, torques=pred.solution.torques) for m in (model, *models))
     else:
         base = pred
         moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, sampling, W=W, torques=pred.solution.torques) for m in models]
@@ -418,6 +416,19 @@ def _motor_columns(
         out = np.zeros((*pred.U.shape[:2], model.structure.n + len(group.links)), complex)
         out[..., j] = X / step
         columns.append(out)
+    return columns
+
+
+def _drive_columns(
+    model: Model, group: Group, pred: Prediction, effect: Effect, steps: Sequence[tuple[np.ndarray, float]]
+) -> list[np.ndarray]:
+    """Those of a drive: what it is given does not change."""
+    motion, n, columns = pred.motion(group), model.structure.n, []
+    drives = [e for e in model.effects if e.hypothesis.channel == "drive"]
+    for p, step in steps:
+        out = np.zeros((*pred.U.shape[:2], n + len(group.links)), complex)
+        out[..., :n] = through_drives([replace(e, p=p) if e is effect else e for e in drives], motion) - pred.U
+        columns.append(out / step)
     return columns
 
 
@@ -464,6 +475,7 @@ def fit(
     weights: Weights | None = None,
     remainders: Sequence[np.ndarray] | None = None,
     most: float = np.inf,
+    exact: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Fit baseline parameters, timing and effects together.
@@ -478,6 +490,8 @@ def fit(
         weights: those to fit under; of the start where None.
         remainders: geometric remainders to start from.
         most: cost of the start above which there is no fit.
+        exact: beside laws of the gears the last steps, and the information, are by exact derivatives (``jacobian``), which
+            take several times as long. Beside others, and in motions, which hardly show springs, these add nothing.
 
     Raises:
         ArithmeticError: where the start costs more.
@@ -501,12 +515,13 @@ def fit(
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
     # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
-    trial_steps = int(any(e.hypothesis.channel == "model" for e in model.effects))
+    new_chain = any(e.hypothesis.channel == "model" for e in model.effects)
     moves, drift = _moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False
+    exact = coarse = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
     for _ in range(iterations):
-        H, b = _normal(problem, model, preds, weights)
+        H, b = _normal(problem, model, preds, weights, exact=exact and not coarse)
         off = x - center
         H_p, b_p = H + np.diag(prior), b - prior * off
         size = np.diag(H_p).copy()
@@ -521,7 +536,7 @@ def fit(
                 if not np.all(np.isfinite(step)):
                     raise FloatingPointError("a step without a size")
                 trial = unpack(model, x + step, limit)
-                new = predictions(problem, trial, Ws, steps=trial_steps, near=preds)
+                new = predictions(problem, trial, Ws, steps=int(new_chain or exact > coarse), near=preds)
                 new_cost = weighted_cost(problem, new, weights)
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                 new_cost = np.inf
@@ -530,6 +545,9 @@ def fit(
                 improved = True
                 break
             damping = max(damping, 1e-4) * 8
+        if not improved and coarse:
+            coarse, damping = False, 1e-3
+            continue
         if not improved:
             converged = True
             break
@@ -548,11 +566,13 @@ def fit(
         if progress is not None:
             progress(f"fit: chi2/dof {cost / count:.3g}")
         if gain < max(gap * cost, 0.02):
-            converged = True
+            converged = not coarse
+            coarse = False
+        if converged:
             break
     if np.any(drift):
         model, preds, Ws, _ = _settled(problem, settled, model, weights)
-    H, _ = _normal(problem, model, preds, weights)
+    H, _ = _normal(problem, model, preds, weights, exact=exact)
     return Fit(model, joint_costs(problem, preds, weights), data_counts(problem), H, coordinate_names(model), tuple(Ws), weights, converged)
 
 
@@ -662,11 +682,11 @@ def _by_joint(problem: Problem, each: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _normal(
-    problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights
+    problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights, *, exact: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
         group, pred = problem.groups[g], preds[g]
-        columns, error = jacobian(problem, model, group, pred), output_error(group, pred)
+        columns, error = jacobian(problem, model, group, pred, exact=exact), output_error(group, pred)
         if group.window is None:
             return columns.normal(weights.whiten[g], error)
         J = as_real(weights.apply(g, group.observe_outputs(columns.dense())))

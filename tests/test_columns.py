@@ -37,3 +37,18 @@ def test_normal_equations_of_products(S, K, n, products, whole, seed):
     r = np.einsum("lij,slj->sli", whiten, residual).ravel()
     np.testing.assert_allclose(H, (J.conj().T @ J).real, rtol=1e-10, atol=1e-10 * max(1.0, np.abs(J).max() ** 2))
     np.testing.assert_allclose(b, (J.conj().T @ r).real, rtol=1e-10, atol=1e-9 * max(1.0, np.abs(J).max() ** 2))
+
+
+def test_columns_take_the_place_of_others():
+    rng = np.random.default_rng(0)
+    columns = Columns(
+        Products(rng.normal(size=(4, 2, 3)) + 0j, rng.normal(size=(2, 4, 3)) + 0j, np.arange(3)),
+        np.array([0, 3, 1]),
+        rng.normal(size=(2, 4, 2, 2)) + 0j,
+        np.array([4, 2]),
+    )
+    new = {3: np.full((2, 4, 2), 3.0 + 0j), 2: np.full((2, 4, 2), 2.0 + 0j), 5: np.full((2, 4, 2), 5.0 + 0j)}
+    out, before = columns.replaced(new).dense(), columns.dense()
+    for c in range(6):
+        np.testing.assert_array_equal(out[..., c], new[c] if c in new else before[..., c])
+    assert columns.replaced({}) is columns

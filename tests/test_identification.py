@@ -14,7 +14,7 @@ from ident.gain import segment_errors
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
 from ident.screening import screen
-from ident.torque_fit import fit, predictions
+from ident.torque_fit import fit, jacobian, pack, predictions, unpack
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
@@ -127,3 +127,38 @@ def test_links_behind_gears_are_found_beside_elastic_hinges(tmp_path):
     best = screen(problem, result, preds, [h for h in catalogue(problem.structure) if h.effect == "gravity_spring"])[0]
     assert best.hypothesis.place == "joint_2"
     assert best.start == pytest.approx([900.0, 0.2], rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def panda_problem(tmp_path_factory):
+    panda = load_robot("panda")
+    data = run_experiment(small_plan(panda, 6, points=1, levels=(1.0,), validation_points=0), seed=6)
+    return set_up(through_files(data, tmp_path_factory.mktemp("panda"))).problem
+
+
+GEAR, LAG = ("hardening_stiffness", "panda_joint4"), ("torque_lag", "panda_joint4")
+
+
+@pytest.mark.parametrize("keys", [(), (GEAR,), (GEAR, LAG), (("payload", "flange"),)])
+def test_exact_columns_are_the_differences_of_what_a_model_predicts(panda_problem, keys):
+    """Gears that give under gravity move the posture, and with it all torques of a motion: with the remainder held that is missed."""
+    problem = panda_problem
+    start = {"hardening_stiffness": [1e9], "torque_lag": [2e-3], "payload": [2.0, 0.02, 0.0, 0.05, 0.01, 0.01, 0.01]}
+    effects = tuple(Effect(h, np.array(start[h.effect])) for h in catalogue(problem.structure) if h.key in keys)
+    model, group = Model(problem.structure, problem.nominal, effects), problem.groups[0]
+    pred = predict(model, group, problem.sampling, steps=20)
+    held, exact = (jacobian(problem, model, group, pred, exact=e).dense() for e in (False, True))
+    x, n = pack(model), problem.structure.n
+    missed, left = [], []
+    steps = [(c, 1e-3) for c in range(2 * n)] + [(4 * n + 1, e.hypothesis.parameters[0].step) for e in effects[:1]]
+    for c, step in steps:
+        ends = []
+        for sign in (1.0, -1.0):
+            y = x.copy()
+            y[c] += sign * step
+            there = unpack(model, y, np.inf)
+            ends.append(predict(there, group, problem.sampling, W=pred.solution.W, steps=20, torques=pred.solution.torques).U)
+        slope = (ends[0] - ends[1])[:, : held.shape[1]] / (2 * step)
+        for errors, columns in ((missed, held), (left, exact)):
+            errors.append(np.linalg.norm(columns[..., c] - slope) / np.linalg.norm(slope))
+    assert max(left) < 0.02 and max(left) < 0.2 * max(missed)

@@ -8,7 +8,7 @@ from ident.hypotheses.kernels import CABLE, LINK, Law, loop_sweep, spring_torque
 from ident.mixing import MEMORY, mixed
 
 SWEEPS = 25  # periods at most until the steady state
-STEADY = 1e-5  # change of the torque from one to the next, over the largest, that ends them
+STEADY = 1e-7  # change of the torque from one to the next, over the largest, that ends them: derivatives are differences
 
 
 def steady_loop(

@@ -45,7 +45,7 @@ PARALLEL = 0.9  # cosine from which on two axes are one
 VECTORS = ("com", "axis")
 DIVISORS = ("stribeck_velocity", "low_stiffness", "transition", "time_constant", "resolution", "yield_torque", "mass", "inertia")
 SIZES = ("torque", "coulomb", "static", "stiffness", "damping", "delay", "limit", "gap", "friction", "coefficient", "cubic")
-LEAST, LARGEST = 1e-12, 1e12  # sizes of parameters, SI
+LEAST, LARGEST = 1e-12, 1e15  # sizes of parameters, SI
 LONGEST = 1.0  # s of a delay
 EFFECTS = {c.name: c for c in _CLASSES}
 
@@ -140,7 +140,8 @@ def _value(key: str, text: str, where: str) -> object:
     except ValueError:
         numbers = ()
     if len(numbers) != count or not all(abs(v) <= LARGEST for v in numbers):
-        raise DataError(f"parameter {key}", where, repr(text), "three numbers with spaces" if count == 3 else "a number")
+        expected = "three numbers with spaces" if count == 3 else "a number"
+        raise DataError(f"parameter {key}", where, repr(text), f"{expected}, of at most {LARGEST:g}")
     low = LEAST if key in DIVISORS else 0.0 if key in SIZES else -LARGEST
     high = LONGEST if key == "delay" else LARGEST
     if count == 1 and not low <= numbers[0] <= high:
