@@ -50,17 +50,19 @@ LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders toget
 SETTLED_BY_INERTIAS = 0.5  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
 HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
 LEAST_HELD_OUT = 2.0  # s of it
+RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
 MAX_SECONDS = 900.0  # of search for causes
 SEED = 0
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A problem with its held-out groups."""
+    """A problem with its held-out groups, the steps of its encoders, and the names of segments that ran away."""
 
     problem: Problem
     held_out: tuple[Group, ...]
     steps: tuple[Steps, ...] = ()
+    ran_away: tuple[str, ...] = ()
 
 
 def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
@@ -77,9 +79,10 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     band = motion_band_hz(dataset, structure, nominal)
     groups = build_groups(dataset, motion_band_hz=band, fast=fast)
     multisines = tuple(g for g in groups if g.window is None)
-    held_out = ()
-    if any(s.role == "validation" for s in dataset.segments):
-        held_out = build_groups(dataset, role="validation", motion_band_hz=band, fast=fast)
+    held_out, ran_away = (), runaways(dataset)
+    told = replace(dataset, segments=tuple(s for s in dataset.segments if s.name not in ran_away))
+    if any(s.role == "validation" for s in told.segments):
+        held_out = build_groups(told, role="validation", motion_band_hz=band, fast=fast)
     q_std, tau_std = _noise(dataset)
     declared = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
     steps = find_steps(dataset, declared) if np.all(declared > 0) else ()
@@ -99,7 +102,18 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
         raise DataError("segments", dataset.name, found, f"more than the {len(nominal.to_log())} parameters: longer records")
     if not moves(dataset, q_std):
         raise DataError("positions", dataset.name, "no joint that moves beyond its noise", "motion that the drives bring about")
-    return Setup(problem, held_out, steps)
+    return Setup(problem, held_out, steps, ran_away)
+
+
+def runaways(dataset: Dataset) -> tuple[str, ...]:
+    """Names of held-out segments in which the loop was lost: their torque is beyond all that a model was fitted to.
+
+    A drive at its limit asks for ever more; what it asks for then cannot be told from how the arm moved, and would outweigh
+    all else that is held out.
+    """
+    peaks = {s.name: float(np.abs(s.tau).max()) for s in dataset.segments}
+    known = max((peaks[s.name] for s in dataset.segments if s.role == "identification"), default=np.inf)
+    return tuple(s.name for s in dataset.segments if s.role == "validation" and peaks[s.name] > RUNAWAY * known)
 
 
 def moves(dataset: Dataset, q_std: np.ndarray) -> bool:
@@ -255,6 +269,9 @@ def diagnose_fully(
     late = find_link_delays(recorded, last, problem.sampling.sample_time)
     separating = separating_experiment(problem, result)
     verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
+    if setup.ran_away:
+        names = ", ".join(setup.ran_away)
+        notes.append(f"Not among the held-out data: {names}. Torques above {RUNAWAY:g} times those of the others say that the loop was lost.")
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
     verdict = replace(verdict, notes=(*verdict.notes, *notes))

@@ -52,6 +52,17 @@ def test_held_out_data_are_predicted_to_the_noise(clean, identified):
         assert share < 0.02
 
 
+def test_a_held_out_segment_that_ran_away_tells_nothing(clean):
+    """Its error would outweigh all others."""
+    data = clean[0]
+    lost = next(s.name for s in data.segments if s.role == "validation")
+    segments = tuple(replace(s, tau=1e3 * s.tau) if s.name == lost else s for s in data.segments)
+    setup, whole = set_up(replace(data, segments=segments)), set_up(data)
+    assert setup.ran_away == (lost,) and not whole.ran_away
+    told, all_of_them = ({n for g in x.held_out for n in g.segments} for x in (setup, whole))
+    assert told == all_of_them - {lost} and told
+
+
 def test_nothing_hidden_nothing_named(clean):
     verdict = diagnose(clean[0])
     assert not verdict.discrepancy.detected and not verdict.causes
