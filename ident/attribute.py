@@ -38,6 +38,7 @@ from ident.search import (
     reweighted,
     simulated,
     under_noise_of_best,
+    under_own_noise,
     worth_a_hinge,
     worth_a_refit,
 )
@@ -416,7 +417,8 @@ def attribute_once(
     before, softly = current, {}
     found, scores = explore(problem, current, hypotheses, least, bare, workers)
     excess = max(current.cost - current.count, 1.0)
-    if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not workers.late:
+    told = bool(found) and settles_its_joint(problem, current, *found[0])
+    if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not told and not workers.late:
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
@@ -428,9 +430,21 @@ def attribute_once(
     bent = bool(ranked) and ranked[0][0].options.get("bends", False)
     spoilt = not problem.motions_alone and (bent or implausible(problem, before))
     allowed = DETECTION_EXCESS - 1.0 if spoilt else FAINT
-    if min(before.chi2_per_dof - 1.0, left_by(ranked) / before.count) > allowed and not workers.late:
+    if min(before.chi2_per_dof - 1.0, left_by(ranked) / before.count) > allowed and not told and not workers.late:
         before, ranked = beside_strong(problem, before, ranked, scores, workers)
     return weighed_round(before, ranked, scores, softly)
+
+
+def settles_its_joint(problem: Problem, current: Fit, h: Hypothesis, result: Fit) -> bool:
+    """Whether a candidate leaves no more than noise of a clear discrepancy at its own joint: what is left has another cause.
+
+    Along the measured motion of the motors most effects reach the torque of their own joint alone.
+    """
+    j = h.joint
+    if h.decoy or j < 0 or h.channel == "model" or current.costs[j] <= FAINT * current.counts[j]:
+        return False
+    own = under_own_noise(problem, result)
+    return bool(own.costs[j] <= DETECTION_EXCESS * own.counts[j])
 
 
 def beside_unclear(
