@@ -6,7 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import LEFT_TO_DECOYS, Round, companions, left_share, outdone, pruned, settled, with_name
+from ident.attribute import (
+    LEFT_TO_DECOYS,
+    Round,
+    companions,
+    left_share,
+    outdone,
+    pruned,
+    settled,
+    settles_its_joint,
+    with_name,
+)
 from ident.baseline import astray
 from ident.diagnose import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
@@ -341,6 +351,24 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     # The same error in noise so large that it hides it is not less of an error.
     hidden = replace(wrong, weights=loud, costs=wrong.counts + 0.01 * (wrong.costs - wrong.counts))
     assert matched(problem, joint, hidden, [wrong])
+
+
+def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identified, named):
+    """Of a discrepancy that is clear there; not so a decoy, nor what changes the chain at all joints."""
+    _, setup, result = identified
+    problem, rub, payload = setup.problem, named["coulomb_friction", "elbow_joint"], named["payload", "flange"]
+    decoy = next(h for h in named.values() if h.decoy and h.joint == rub.joint)
+    clear, faint = (replace(result, costs=result.costs + off * result.counts * (np.arange(6) == rub.joint)) for off in (9.0, 1.5))
+
+    def with_friction(torque):
+        return replace(result, model=replace(result.model, effects=(Effect(rub, np.array([torque, 0.0, 1e-3])),)))
+
+    assert settles_its_joint(problem, clear, rub, with_friction(1e-3))
+    assert not settles_its_joint(problem, clear, rub, with_friction(5.0))
+    assert not settles_its_joint(problem, faint, rub, with_friction(1e-3))
+    assert not settles_its_joint(problem, clear, decoy, with_friction(1e-3))
+    assert not settles_its_joint(problem, clear, payload, with_friction(1e-3))
+    assert not settles_its_joint(problem, clear, named["coulomb_friction", "wrist_1_joint"], with_friction(1e-3))
 
 
 def test_a_start_that_loses_the_data_is_not_followed(identified, named):
