@@ -49,6 +49,7 @@ REFITS = 8  # candidates refitted in a round
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
 POLISH_STEPS = 40  # of the winner of a round
 PER_EFFECT = 2  # of one effect, at most
+AS_LIKELY = 0.97  # screened gain, relative to the best, from which one more of the same effect is refitted too
 NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
 MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place: share of the highest resonance tried, damping
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
@@ -297,7 +298,7 @@ def refit(
 
 
 def choose(scores: Sequence[Score]) -> list[Score]:
-    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
+    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times where steps tell its places apart.
 
     A linear step hardly tells where a hinge is: if one is worth a refit, so are those before and after other joints
     that come near it.
@@ -306,7 +307,7 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     top = scores[0].gain if scores else 0.0
     for score in scores:
         same = sum(s.hypothesis.effect == score.hypothesis.effect for s in out)
-        if score.start is None or same >= PER_EFFECT or score.gain < KEEP_RATIO * top:
+        if score.start is None or score.gain < (KEEP_RATIO if same < PER_EFFECT else AS_LIKELY) * top:
             continue
         out.append(score)
         if len(out) == REFITS:

@@ -26,7 +26,7 @@ from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.search import STRONG, matched, polish, refit
+from ident.search import STRONG, choose, matched, polish, refit
 from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
@@ -351,6 +351,14 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     # The same error in noise so large that it hides it is not less of an error.
     hidden = replace(wrong, weights=loud, costs=wrong.counts + 0.01 * (wrong.costs - wrong.counts))
     assert matched(problem, joint, hidden, [wrong])
+
+
+@pytest.mark.parametrize(("last", "expected"), [(0.98, 3), (0.90, 2)])
+def test_places_that_steps_do_not_tell_apart_are_all_tried(named, last, expected):
+    """Two of an effect are refitted, and more where they explain as much: the inertia of a wrist's links, one behind the other."""
+    links = ("wrist_1_link", "wrist_2_link", "wrist_3_link")
+    scores = [SimpleNamespace(hypothesis=named["link_inertia", k], gain=g, start=np.ones(5)) for k, g in zip(links, (1.0, 0.99, last), strict=True)]
+    assert len(choose(scores)) == expected
 
 
 def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identified, named):
