@@ -81,7 +81,7 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     multisines = tuple(g for g in groups if g.window is None)
     held_out, ran_away = (), runaways(dataset)
     told = replace(dataset, segments=tuple(s for s in dataset.segments if s.name not in ran_away))
-    if any(s.role == "validation" for s in told.segments):
+    if told.select(role="validation"):
         held_out = build_groups(told, role="validation", motion_band_hz=band, fast=fast)
     q_std, tau_std = _noise(dataset)
     declared = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
@@ -111,9 +111,8 @@ def runaways(dataset: Dataset) -> tuple[str, ...]:
     A drive at its limit asks for ever more; what it asks for then cannot be told from how the arm moved, and would outweigh
     all else that is held out.
     """
-    peaks = {s.name: float(np.abs(s.tau).max()) for s in dataset.segments}
-    known = max((peaks[s.name] for s in dataset.segments if s.role == "identification"), default=np.inf)
-    return tuple(s.name for s in dataset.segments if s.role == "validation" and peaks[s.name] > RUNAWAY * known)
+    known = max((np.abs(s.tau).max() for s in dataset.select(role="identification")), default=np.inf)
+    return tuple(s.name for s in dataset.select(role="validation") if np.abs(s.tau).max() > RUNAWAY * known)
 
 
 def moves(dataset: Dataset, q_std: np.ndarray) -> bool:

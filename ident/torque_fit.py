@@ -299,6 +299,7 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction, *, 
     """
     m = len(model.par.to_log())
     top = compared_lines(group)
+    now = _again(problem, model, group, pred, 1) if exact else pred
     n, n_e = model.structure.n, len(model.structure.elastic)
     extra = len(pred.structure.elastic) - n_e
     keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
@@ -306,20 +307,27 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction, *, 
     late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
     late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
     baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
-    baseline = baseline.replaced(_through_drives(baseline, model, group, pred))
-    baseline = baseline.replaced(_differences(problem, model, group, pred, exact))
+    baseline = baseline.replaced(_passed_on(baseline, model, group, pred))
+    baseline = baseline.replaced(_differences(problem, model, group, pred, now, exact))
     if not problem.free_timing:
         baseline.whole[..., baseline.whole_at == m] = 0.0
     effects = [
         column[:, :top]
         for i in range(len(model.effects))
-        for column in _effect_columns(problem, model, group, pred, i, exact)
+        for column in _effect_columns(problem, model, group, pred, now, i, exact)
     ]
     return baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
 
 
-def _differences(problem: Problem, model: Model, group: Group, pred: Prediction, exact: bool) -> dict[int, np.ndarray]:
-    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` the links, by differences.
+def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps: int) -> Prediction:
+    """What a model near that of ``pred`` predicts, from its geometric remainder, ``steps`` on, and its torques."""
+    return predict(model, group, problem.sampling, W=pred.solution.W, steps=steps, torques=pred.solution.torques)
+
+
+def _differences(
+    problem: Problem, model: Model, group: Group, pred: Prediction, now: Prediction, exact: bool
+) -> dict[int, np.ndarray]:
+    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` the links, by differences from ``now``.
 
     These laws move with the gear's spring and damper; and where the recorded torque says its deflection, with what
     the motor takes of that, and with the timing.
@@ -332,21 +340,19 @@ def _differences(problem: Problem, model: Model, group: Group, pred: Prediction,
         steps |= dict.fromkeys(np.flatnonzero(_moves_links(model)[:m]).tolist(), BASELINE_STEP)
     if along:
         steps[m] = TIMING_STEP
-    if not steps:
-        return {}
+    x, top = pack(model), compared_lines(group)
 
-    def outputs(there: Model) -> np.ndarray:
-        held = {"W": pred.solution.W, "torques": pred.solution.torques}
-        return predict(there, group, problem.sampling, **held, steps=int(exact)).outputs(group)[:, : compared_lines(group)]
+    def column(c: int, step: float) -> np.ndarray:
+        there = unpack(model, x + step * (np.arange(len(x)) == c), np.inf)
+        change = _again(problem, there, group, pred, int(exact)).outputs(group) - now.outputs(group)
+        return change[:, :top] / step
 
-    now = outputs(model)
-    x = pack(model)
-    return {c: (outputs(unpack(model, x + step * (np.arange(len(x)) == c), np.inf)) - now) / step for c, step in steps.items()}
+    return {c: column(c, step) for c, step in steps.items()}
 
 
-def _through_drives(columns: Columns, model: Model, group: Group, pred: Prediction) -> dict[int, np.ndarray]:
+def _passed_on(columns: Columns, model: Model, group: Group, pred: Prediction) -> dict[int, np.ndarray]:
     """Baseline columns of the torque that drives with effects pass on; none where there are no such drives."""
-    drives = [e for e in model.effects if e.hypothesis.channel == "drive"]
+    drives = _drives(model)
     if not drives:
         return {}
     dense = columns.dense()
@@ -357,6 +363,11 @@ def _through_drives(columns: Columns, model: Model, group: Group, pred: Predicti
         passed = _change_passed(effect, motion, full)
         dense[:, :, j] = np.moveaxis(passed[:, :, : dense.shape[1]], 0, -1)
     return dict(enumerate(np.moveaxis(dense, -1, 0)))
+
+
+def _drives(model: Model) -> list[Effect]:
+    """Effects of the drives, in the order in which they act."""
+    return [e for e in model.effects if e.hypothesis.channel == "drive"]
 
 
 def _change_passed(drive: Effect, motion: Motion, X: np.ndarray) -> np.ndarray:
@@ -371,9 +382,9 @@ def compared_lines(group: Group) -> int:
 
 
 def _effect_columns(
-    problem: Problem, model: Model, group: Group, pred: Prediction, i: int, exact: bool
+    problem: Problem, model: Model, group: Group, pred: Prediction, now: Prediction, i: int, exact: bool
 ) -> list[np.ndarray]:
-    """Derivatives (S, L, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences."""
+    """Derivatives (S, L, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences from ``now``."""
     effect = model.effects[i]
     h, steps = effect.hypothesis, []
     for c, q in enumerate(h.parameters):
@@ -391,12 +402,12 @@ def _effect_columns(
         Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
         for p, _ in steps
     ]
-    W, sampling = pred.solution.W, problem.sampling
-    if h.channel == "model" or exact:
-        base, *moved = (predict(m, group, sampling, W=W, steps=1, torques=pred.solution.torques) for m in (model, *models))
+    if exact or h.channel == "model":
+        base = now if exact else _again(problem, model, group, pred, 1)
+        moved = [_again(problem, m, group, pred, 1) for m in models]
     else:
-        base = pred
-        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, sampling, W=W, torques=pred.solution.torques) for m in models]
+        base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}
+        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
     return [(there.outputs(group) - base.outputs(group)) / step for there, (_, step) in zip(moved, steps, strict=True)]
 
 
@@ -408,7 +419,7 @@ def _motor_columns(
     motion = beside(model.effects, effect, pred.motion(group))
     k = pred.par.stiffness[j]
     now, columns = h.law(effect.p, motion, j, k), []
-    drives = [e for e in model.effects if e.hypothesis.channel == "drive" and e.hypothesis.joint == j]
+    drives = [e for e in _drives(model) if e.hypothesis.joint == j]
     for p, step in steps:
         X = pred.plane.record * motion.lines(h.law(p, motion, j, k) - now)
         for drive in drives:
@@ -424,7 +435,7 @@ def _drive_columns(
 ) -> list[np.ndarray]:
     """Those of a drive: what it is given does not change."""
     motion, n, columns = pred.motion(group), model.structure.n, []
-    drives = [e for e in model.effects if e.hypothesis.channel == "drive"]
+    drives = _drives(model)
     for p, step in steps:
         out = np.zeros((*pred.U.shape[:2], n + len(group.links)), complex)
         out[..., :n] = through_drives([replace(e, p=p) if e is effect else e for e in drives], motion) - pred.U
@@ -519,9 +530,10 @@ def fit(
     moves, drift = _moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False
-    exact = coarse = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
+    exact = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
+    fine = False  # whether the steps are by exact derivatives already
     for _ in range(iterations):
-        H, b = _normal(problem, model, preds, weights, exact=exact and not coarse)
+        H, b = _normal(problem, model, preds, weights, exact=fine)
         off = x - center
         H_p, b_p = H + np.diag(prior), b - prior * off
         size = np.diag(H_p).copy()
@@ -536,7 +548,7 @@ def fit(
                 if not np.all(np.isfinite(step)):
                     raise FloatingPointError("a step without a size")
                 trial = unpack(model, x + step, limit)
-                new = predictions(problem, trial, Ws, steps=int(new_chain or exact > coarse), near=preds)
+                new = predictions(problem, trial, Ws, steps=int(new_chain or fine), near=preds)
                 new_cost = weighted_cost(problem, new, weights)
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                 new_cost = np.inf
@@ -545,12 +557,12 @@ def fit(
                 improved = True
                 break
             damping = max(damping, 1e-4) * 8
-        if not improved and coarse:
-            coarse, damping = False, 1e-3
-            continue
         if not improved:
-            converged = True
-            break
+            converged = fine == exact
+            if converged:
+                break
+            fine, damping = True, 1e-3
+            continue
         gain = cost - new_cost
         drift += np.abs(pack(trial) - x)
         model, x = trial, pack(trial)
@@ -566,10 +578,10 @@ def fit(
         if progress is not None:
             progress(f"fit: chi2/dof {cost / count:.3g}")
         if gain < max(gap * cost, 0.02):
-            converged = not coarse
-            coarse = False
-        if converged:
-            break
+            converged = fine == exact
+            if converged:
+                break
+            fine = True
     if np.any(drift):
         model, preds, Ws, _ = _settled(problem, settled, model, weights)
     H, _ = _normal(problem, model, preds, weights, exact=exact)

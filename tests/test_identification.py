@@ -14,7 +14,7 @@ from ident.gain import segment_errors
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
 from ident.screening import screen
-from ident.torque_fit import fit, jacobian, pack, predictions, unpack
+from ident.torque_fit import fit, jacobian, output_error, pack, predictions, unpack
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
@@ -61,6 +61,7 @@ def test_a_held_out_segment_that_ran_away_tells_nothing(clean):
     assert setup.ran_away == (lost,) and not whole.ran_away
     told, all_of_them = ({n for g in x.held_out for n in g.segments} for x in (setup, whole))
     assert told == all_of_them - {lost} and told
+    assert any(lost in note for note in diagnose(replace(data, segments=segments), max_causes=0).notes)
 
 
 def test_nothing_hidden_nothing_named(clean):
@@ -173,3 +174,24 @@ def test_exact_columns_are_the_differences_of_what_a_model_predicts(panda_proble
         for errors, columns in ((missed, held), (left, exact)):
             errors.append(np.linalg.norm(columns[..., c] - slope) / np.linalg.norm(slope))
     assert max(left) < 0.02 and max(left) < 0.2 * max(missed)
+
+
+@pytest.mark.parametrize(("key", "value", "exact"), [(GEAR, 1e9, True), (("coulomb_friction", "panda_joint4"), 0.5, False)])
+def test_a_winner_beside_a_law_of_the_gear_is_fitted_by_exact_columns(panda_problem, key, value, exact):
+    """And no other: the information that its deviations come from says which were used."""
+    problem = panda_problem
+    (h,) = (h for h in catalogue(problem.structure) if h.key == key)
+    start = Model(problem.structure, problem.nominal, (Effect(h, np.array([value, 0.0, 1e-3][: len(h.parameters)])),))
+    first = fit(problem, start, iterations=2)
+    result = fit(problem, first.model, iterations=1, weights=first.weights, remainders=first.remainders, exact=True)
+    preds = predictions(problem, result.model, result.remainders)
+    of_columns = {}
+    for e in (False, True):
+        parts = [
+            jacobian(problem, result.model, group, pred, exact=e).normal(weights, output_error(group, pred))[0]
+            for group, pred, weights in zip(problem.groups, preds, result.weights.whiten, strict=True)
+        ]
+        of_columns[e] = sum(parts)
+    size = np.sqrt(np.diag(result.information))
+    off = {e: np.abs((result.information - H) / np.outer(size, size)).max() for e, H in of_columns.items()}
+    assert off[exact] < 1e-3 < off[not exact]

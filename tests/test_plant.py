@@ -66,6 +66,8 @@ def test_every_effect_changes_the_data_and_stays_bounded(name):
 def test_an_effect_is_read_from_text(ur10):
     effect = parse_effect("coulomb_friction@elbow_joint:torque=3,asymmetry=0.1", ur10)
     assert effect.place == "elbow_joint" and parameters_of(effect) == {"torque": 3.0, "asymmetry": 0.1}
+    heavy = parse_effect("hardening_stiffness@elbow_joint:cubic=7.6e12", ur10)
+    assert parameters_of(heavy) == {"cubic": 7.6e12}
 
 
 @pytest.mark.parametrize(
@@ -75,6 +77,7 @@ def test_an_effect_is_read_from_text(ur10):
         ("cogging@knee:amplitude=1", "knee"),
         ("cogging@elbow_joint:size=1", "size"),
         ("cogging@elbow_joint:amplitude=big", "big"),
+        ("cogging@elbow_joint:amplitude=1e16", "at most 1e"),
         ("torque_delay@elbow_joint", None),
         ("nonsense", "nonsense"),
     ],
