@@ -48,9 +48,9 @@ HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate i
 REFITS = 8  # candidates refitted in a round
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
 POLISH_STEPS = 40  # of the winner of a round
-PER_EFFECT = 2  # of one effect, at most, where a linear step tells its places apart
-AS_LIKELY = 0.97  # screened gain, relative to the best, from which one more of the same effect is refitted too
+PER_EFFECT = 2  # of one effect, at most
 NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
+NEAR_BODY = 1.0 / 3.0  # the same of a body's inertia, where one answers best
 MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place: share of the highest resonance tried, damping
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
@@ -235,7 +235,10 @@ def explore(
         fits = workers.map_in_time(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
         return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
 
-    found = begun(choose(scores)) if answered else []
+    chosen = choose(scores) if answered else []
+    found = begun(chosen)
+    if not workers.late:
+        found += begun(other_bodies(found, chosen, scores))
     if not problem.motions_alone and left_by(found) > bare * excess and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
@@ -298,7 +301,7 @@ def refit(
 
 
 def choose(scores: Sequence[Score]) -> list[Score]:
-    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times where steps tell its places apart.
+    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
 
     A linear step hardly tells where a hinge is: if one is worth a refit, so are those before and after other joints
     that come near it.
@@ -307,7 +310,7 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     top = scores[0].gain if scores else 0.0
     for score in scores:
         same = sum(s.hypothesis.effect == score.hypothesis.effect for s in out)
-        if score.start is None or score.gain < (KEEP_RATIO if same < PER_EFFECT else AS_LIKELY) * top:
+        if score.start is None or same == PER_EFFECT or score.gain < KEEP_RATIO * top:
             continue
         out.append(score)
         if len(out) == REFITS:
@@ -325,6 +328,17 @@ def choose(scores: Sequence[Score]) -> list[Score]:
 def _side(score: Score) -> tuple[tuple[str, str], bool]:
     """Where a hinge is."""
     return score.hypothesis.key, score.hypothesis.options["before"]
+
+
+def other_bodies(found: Sequence[tuple[Hypothesis, Fit]], tried: Sequence[Score], scores: Sequence[Score]) -> list[Score]:
+    """Bodies not yet ``tried`` whose inertia a linear step puts near the best of them, where that of some body answers best.
+
+    What one link weighs more another does nearly as well: linear steps tell hardly which of them it is.
+    """
+    if not found or "body" not in min(found, key=lambda x: x[1].cost)[0].options:
+        return []
+    bodies = [s for s in scores if "body" in s.hypothesis.options and s.start is not None]
+    return [s for s in bodies if all(s is not t for t in tried) and s.gain >= NEAR_BODY * bodies[0].gain]
 
 
 def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Sequence[Score]) -> list[Score]:

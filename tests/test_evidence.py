@@ -26,7 +26,7 @@ from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.search import STRONG, choose, matched, polish, refit
+from ident.search import STRONG, choose, matched, other_bodies, polish, refit
 from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
@@ -353,12 +353,19 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     assert matched(problem, joint, hidden, [wrong])
 
 
-@pytest.mark.parametrize(("last", "expected"), [(0.98, 3), (0.90, 2)])
-def test_places_that_steps_do_not_tell_apart_are_all_tried(named, last, expected):
-    """Two of an effect are refitted, and more where they explain as much: the inertia of a wrist's links, one behind the other."""
-    links = ("wrist_1_link", "wrist_2_link", "wrist_3_link")
-    scores = [SimpleNamespace(hypothesis=named["link_inertia", k], gain=g, start=np.ones(5)) for k, g in zip(links, (1.0, 0.99, last), strict=True)]
-    assert len(choose(scores)) == expected
+def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
+    """Two of an effect are refitted; the inertia of links one behind the other is hardly told by linear steps."""
+    names = ("forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link")
+    gains = (1.0, 0.99, 0.9, 0.1)
+    scores = [SimpleNamespace(hypothesis=named["link_inertia", k], gain=g, start=np.ones(5)) for k, g in zip(names, gains, strict=True)]
+    rub = SimpleNamespace(hypothesis=named["coulomb_friction", "elbow_joint"], gain=0.95, start=np.ones(3))
+    scores.insert(2, rub)
+    tried = choose(scores)
+    assert tried == [scores[0], scores[1], rub]
+    found = [(s.hypothesis, SimpleNamespace(cost=c)) for s, c in zip(tried, (2.0, 1.0, 3.0), strict=True)]
+    assert other_bodies(found, tried, scores) == [scores[3]]
+    better = [*found, (rub.hypothesis, SimpleNamespace(cost=0.5))]
+    assert other_bodies(better, tried, scores) == [] == other_bodies([], tried, scores)
 
 
 def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identified, named):

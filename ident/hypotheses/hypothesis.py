@@ -118,7 +118,7 @@ class Hypothesis:
             one, or where ``give(p)``, rad, is less than the noise of the position. ``essential`` names the parameter without
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm
             may have several steady motions with it. ``dry``: a friction that at rest balances what is asked of it.
-            ``nats``: log odds before the data, 0 where there is no reason.
+            ``nats``: log odds before the data, 0 where there is no reason. ``body``: the link whose inertia it changes.
             ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
     """
 

@@ -205,7 +205,7 @@ def payload(link: str) -> Hypothesis:
         "An unknown load of {mass:.3g} kg hangs at the flange: anti-resonances fall at every posture and the gravity"
         " torque changes with them.",
         variable="posture",
-        options={"change": change, "responses": responses, "start": start},
+        options={"body": link, "change": change, "responses": responses, "start": start},
     )
 
 
@@ -250,6 +250,7 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False) -> Hyp
         " what the model says, its centre of mass off by ({com_x:.3g}, {com_y:.3g}, {com_z:.3g}) m.",
         variable="posture",
         options={
+            "body": link,
             "nats": -LOAD_NATS if carries_load else 0.0,
             "carries_load": carries_load,  # what it carries and its own body are one to the data
             "change": lambda p: Change(links=((link, how(p)),)),
