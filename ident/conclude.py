@@ -6,8 +6,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from ident.attribute import Attribution
-from ident.baseline import UNDETERMINED
+from ident.attribute import DETECTION_LEVEL, Attribution
+from ident.baseline import DETECTION_EXCESS, UNDETERMINED
 from ident.dataset import Dataset
 from ident.evidence import Candidate, pointless
 from ident.extended import Effect, Prediction, is_along_record
@@ -121,6 +121,7 @@ def conclude(
         residual_description=description,
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
+            *faint_note(result),
             *(nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy),
             *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
         ),
@@ -173,6 +174,16 @@ def record_note(effect: Effect) -> str:
     return (
         f"With {effect.hypothesis.effect.replace('_', ' ')} {effect.hypothesis.place} has several steady motions: in the"
         " periodic segments the recorded torque said which it made, a simulation may settle in another."
+    )
+
+
+def faint_note(result: Attribution) -> tuple[str, ...]:
+    """Why what is no chance is not taken for a discrepancy, in a sentence; nothing where the model leaves noise."""
+    if result.detected or result.p_value >= DETECTION_LEVEL:
+        return ()
+    return (
+        f"The model leaves {result.baseline.chi2_per_dof:.3g} times the power of the noise that was estimated: more than chance"
+        f" (p = {result.p_value:.1g}), but up to {DETECTION_EXCESS:g} times may be an error of that estimate.",
     )
 
 

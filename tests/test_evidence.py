@@ -8,6 +8,7 @@ import pytest
 
 from ident.attribute import (
     LEFT_TO_DECOYS,
+    Attribution,
     Round,
     companions,
     left_share,
@@ -18,6 +19,7 @@ from ident.attribute import (
     with_name,
 )
 from ident.baseline import astray
+from ident.conclude import faint_note
 from ident.diagnose import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
 from ident.extended import Effect, along_record
@@ -366,6 +368,18 @@ def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
     assert other_bodies(found, tried, scores) == [scores[3]]
     better = [*found, (rub.hypothesis, SimpleNamespace(cost=0.5))]
     assert other_bodies(better, tried, scores) == [] == other_bodies([], tried, scores)
+
+
+def test_what_is_no_chance_and_yet_no_discrepancy_is_said():
+    """A tiny p-value beside ``detected: false`` is explained; none is needed where the model leaves noise, or causes were sought."""
+    left = SimpleNamespace(chi2_per_dof=1.07)
+
+    def notes(detected: bool, p_value: float) -> tuple[str, ...]:
+        return faint_note(Attribution(left, detected, p_value, (), left, False))
+
+    (said,) = notes(False, 1e-14)
+    assert "1.07 times" in said and "p = 1e-14" in said
+    assert notes(False, 0.3) == () == notes(True, 1e-14)
 
 
 def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identified, named):
