@@ -75,7 +75,7 @@ def run_loop(
     batch = Batch(plant.model, S, nthread=2)
     x, v, force = batch.bind("qpos"), batch.bind("qvel"), batch.bind("qfrc_applied")
     x[:] = qpos
-    run = Run(S, h, 1 / sample_rate, plant.robot, plant.drives, start)
+    run = Run(S, h, 1 / sample_rate, plant.robot, plant.drives, plant.model, start)
     torques = [e.torque(run) for e in plant.effects if callable(getattr(e, "torque", None))]
     deliver = [(run.joint(e.place), e.deliver(run)) for e in plant.effects if hasattr(e, "deliver")]
     measure = [

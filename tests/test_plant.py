@@ -1,5 +1,6 @@
 """The plant against closed forms and against its own description."""
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -8,6 +9,7 @@ from robot_assets.robot import load_robot
 from robot_assets.urdf import read_urdf
 from sim import EFFECTS, draw_effect, parse_effect, run_experiment
 from sim.effects import make_effect, parameters_of, valid_places
+from sim.effects.effect import Run, State, carried
 from sim.plant import build_plant, gravity_torque, rest
 from tests.conftest import small_plan
 
@@ -19,6 +21,25 @@ def test_rest_sags_by_torque_over_stiffness(ur10):
     assert np.allclose(x[plant.motor], q)
     assert np.allclose(ur10.array("stiffness") * (q - x[plant.link]), hold, rtol=1e-6, atol=1e-6)
     assert np.abs(hold - gravity_torque(plant, q)).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    "hidden", [None, "hardening_stiffness:cubic=2e9", "softening_stiffness:low_stiffness=8e3,transition=5e-4", "backlash:gap=1e-3"]
+)
+def test_friction_by_load_sees_all_that_the_gear_carries(ur10, hidden):
+    """The torque of the gear that friction by load grows with is the one that the simulator puts on the link, whatever law it has."""
+    place = "elbow_joint"
+    effects = [] if hidden is None else [parse_effect(f"{hidden.split(':')[0]}@{place}:{hidden.split(':')[1]}", ur10)]
+    plant = build_plant(ur10, effects)
+    j, data = ur10.joint_names.index(place), mujoco.MjData(plant.model)
+    load = carried(Run(1, 1e-4, 1e-3, ur10, plant.drives, plant.model, np.zeros(1)), place)
+    for wind_up, rate in ((2e-4, 0.0), (-3e-3, 0.2), (4e-3, -0.1)):
+        data.qpos[plant.motor[j]], data.qvel[plant.motor[j]] = wind_up, rate
+        mujoco.mj_forward(plant.model, data)
+        on_link = data.qfrc_spring[plant.link[j]] + data.qfrc_damper[plant.link[j]]
+        q, v, q_link, v_link = (x[None] for x in (data.qpos[plant.motor], data.qvel[plant.motor], data.qpos[plant.link], data.qvel[plant.link]))
+        state = State(np.zeros(1), q, v, q_link, v_link, q, v, q_link)
+        assert load(state) == pytest.approx([on_link], rel=1e-9, abs=1e-9)
 
 
 def test_two_masses_resonate_where_they_should():

@@ -12,8 +12,10 @@ may define any of:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from robot_assets.robot import Robot
@@ -21,13 +23,14 @@ from robot_assets.robot import Robot
 
 @dataclass(frozen=True)
 class Run:
-    """A run: number of simulations S, integration step h (s), sample time (s), start times (S,)."""
+    """A run: number of simulations S, integration step h (s), sample time (s), compiled model, start times (S,)."""
 
     simulations: int
     step: float
     sample_time: float
     robot: Robot
     drives: dict[str, np.ndarray]
+    model: mujoco.MjModel
     start: np.ndarray
 
     def joint(self, name: str) -> int:
@@ -59,3 +62,28 @@ class Torque:
     joint: int
     motor: np.ndarray | float = 0.0
     link: np.ndarray | float = 0.0
+
+
+GEAR_SPRINGS = "gear", "outer"  # tendons of a joint that carry torque from its motor to its link
+
+
+def carried(run: Run, place: str) -> Callable[[State], np.ndarray]:
+    """Torque (S,) that springs and damper of a joint's gear carry, laws in its tendons included, N m.
+
+    An element that is a torque of its own, as that of a hysteresis, is beside them.
+    """
+    j, model = run.joint(place), run.model
+    names = [model.tendon(i).name for i in range(model.ntendon)]
+    ids = [names.index(f"{kind}:{place}") for kind in GEAR_SPRINGS if f"{kind}:{place}" in names]
+    springs = [(model.tendon_stiffness[i], *model.tendon_stiffnesspoly[i], *model.tendon_lengthspring[i]) for i in ids]
+    damping = sum(model.tendon_damping[i] for i in ids)
+
+    def at(x: State) -> np.ndarray:
+        delta = x.q[:, j] - x.q_link[:, j]
+        total = damping * (x.v[:, j] - x.v_link[:, j])
+        for stiffness, second, third, low, high in springs:
+            over = delta - np.clip(delta, low, high)
+            total = total + over * (stiffness + over * (second + over * third))
+        return total
+
+    return at

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.effects.effect import Run, State, Torque
+from sim.effects.effect import Run, State, Torque, carried
 
 REVERSAL = 1e-3  # rad/s, velocity over which a regularised sign turns
 
@@ -89,12 +89,10 @@ class LoadDependentFriction:
     name = "load_dependent_friction"
 
     def torque(self, run: Run) -> Callable[[State], Torque]:
-        j = run.joint(self.place)
-        k, d = run.drives["stiffness"][j], run.drives["damping"][j]
+        j, load = run.joint(self.place), carried(run, self.place)
 
         def step(x: State) -> Torque:
-            load = k * (x.q[:, j] - x.q_link[:, j]) + d * (x.v[:, j] - x.v_link[:, j])
-            return Torque(j, -self.coefficient * np.abs(load) * smooth_sign(x.v[:, j]))
+            return Torque(j, -self.coefficient * np.abs(load(x)) * smooth_sign(x.v[:, j]))
 
         return step
 
