@@ -28,6 +28,7 @@ from ident.trust import (
     known_probability,
     left_of,
     shadowed,
+    shown,
     too_fast,
 )
 from ident.units import linear_names, parameter_unit, text_at, unit_at
@@ -84,7 +85,8 @@ def conclude(
         found = rounds[effect.hypothesis.key]
         trust = known_probability(left_of(effect.hypothesis, result), doubted)
         trust *= explained_share(found, final)
-        if pointless(effect) or too_fast(problem, last, effect) or shadowed(found, result.rounds):
+        doubtful = pointless(effect) or too_fast(problem, last, effect) or shadowed(found, result.rounds)
+        if doubtful or not shown(effect, final, covariance):
             trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
     linear = linear_names(dataset.robot)

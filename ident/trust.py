@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident.attribute import Attribution, Round
+from ident.attribute import UNTOLD, Attribution, Round
 from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
 from ident.hypotheses import Hypothesis
@@ -76,6 +76,15 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
     settled = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
     expected = 1.0 - np.sqrt(left)
     return gain.gap_closed < max(CARRIED if settled else CLOSED, expected - SHORT)
+
+
+def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
+    """Whether the data tell the size of what makes an effect the one that it is named, to about a factor of ``e``."""
+    h = effect.hypothesis
+    if "shown" not in h.options:
+        return True
+    i = final.names.index(f"{h.effect}@{h.place}:{h.options['shown']}")
+    return bool(covariance[i, i] < UNTOLD**2)
 
 
 def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect) -> bool:

@@ -41,7 +41,7 @@ from ident.torque_fit import (
     predictions,
     weighted_cost,
 )
-from ident.trust import shadowed
+from ident.trust import shadowed, shown
 from ident.verdict import Gain
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
@@ -368,6 +368,16 @@ def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
     assert other_bodies(found, tried, scores) == [scores[3]]
     better = [*found, (rub.hypothesis, SimpleNamespace(cost=0.5))]
     assert other_bodies(better, tried, scores) == [] == other_bodies([], tried, scores)
+
+
+@pytest.mark.parametrize(("std", "trusted"), [(0.02, True), (1.5, False)])
+def test_a_hysteresis_of_which_no_yielding_is_seen_is_not_trusted(named, std, trusted):
+    """Without a limit that the data know it is a spring beside the gear's."""
+    yields, rub = named["hysteresis", "elbow_joint"], named["coulomb_friction", "elbow_joint"]
+    names = tuple(f"hysteresis@elbow_joint:{q.name}" for q in yields.parameters)
+    final, covariance = SimpleNamespace(names=names), np.diag([1e-4, std**2, 2.0, 2.0])
+    assert shown(Effect(yields, np.array([1e4, 5.0, 5.0, 0.0])), final, covariance) == trusted
+    assert shown(Effect(rub, np.array([5.0, 0.0, 1e-3])), final, covariance)
 
 
 def test_what_is_no_chance_and_yet_no_discrepancy_is_said():

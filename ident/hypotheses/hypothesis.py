@@ -119,6 +119,7 @@ class Hypothesis:
             which nothing is left of the effect, ``trivial(p)`` says so of all parameters together. ``bends``: the arm
             may have several steady motions with it. ``dry``: a friction that at rest balances what is asked of it.
             ``nats``: log odds before the data, 0 where there is no reason. ``body``: the link whose inertia it changes.
+            ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a spring.
             ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
     """
 

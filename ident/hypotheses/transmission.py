@@ -118,7 +118,10 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
         "The torque of {joint} makes loops against the gear's deflection: an element of {stiffness:.3g} N m/rad"
         " that yields at {yield_torque:.3g} N m.",
         variable="delta",
-        options={"size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms, ROUNDED, 0.0])},
+        options={
+            "size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms, ROUNDED, 0.0]),
+            "shown": "yield_torque",
+        },
     )
 
 
