@@ -42,6 +42,26 @@ def test_friction_by_load_sees_all_that_the_gear_carries(ur10, hidden):
         assert load(state) == pytest.approx([on_link], rel=1e-9, abs=1e-9)
 
 
+def test_an_error_of_the_transmission_goes_through_the_law_of_the_gear(ur10):
+    """Motor and link feel the law at the wind-up with the error in it, and the motor the slope of the error too (virtual work)."""
+    place, cubic, size, n = "elbow_joint", 2e9, 2e-3, 40.0
+    effects = (make_effect("hardening_stiffness", place, cubic=cubic), make_effect("transmission_error", place, amplitude=size, periods_per_rev=n, phase=0.3))
+    plant = build_plant(ur10, effects)
+    j, rest_of = ur10.joint_names.index(place), np.zeros((1, ur10.n))
+    q, v = rest_of.copy(), rest_of.copy()
+    q[0, j], v[0, j] = 3e-3, 0.2
+    torque = effects[1].torque(Run(1, 1e-4, 1e-3, ur10, plant.drives, plant.model, np.zeros(1)))(State(np.zeros(1), q, v, rest_of, rest_of, q, v, rest_of))
+    k, d = (plant.drives[x][j] for x in ("stiffness", "damping"))
+    error, slope = size * np.sin(n * 3e-3 + 0.3), size * n * np.cos(n * 3e-3 + 0.3)
+
+    def law(wind_up: float, rate: float) -> float:
+        return k * wind_up + cubic * wind_up**3 + d * rate
+
+    whole, spring = law(3e-3 + error, 0.2 * (1.0 + slope)), law(3e-3, 0.2)
+    assert torque.link == pytest.approx([whole - spring], rel=1e-9)
+    assert torque.motor == pytest.approx([spring - whole - slope * whole], rel=1e-9)
+
+
 def test_two_masses_resonate_where_they_should():
     robot = load_robot("twomass")
     plan = small_plan(robot, 0, points=1, levels=(1.0,), validation_points=0, sample_rate=2500.0, period=2500, band_hz=(20.0, 120.0), periods=4, transient_periods=2)

@@ -67,9 +67,10 @@ class Torque:
 GEAR_SPRINGS = "gear", "outer"  # tendons of a joint that carry torque from its motor to its link
 
 
-def carried(run: Run, place: str) -> Callable[[State], np.ndarray]:
+def carried(run: Run, place: str) -> Callable[..., np.ndarray]:
     """Torque (S,) that springs and damper of a joint's gear carry, laws in its tendons included, N m.
 
+    It is asked for a state, with more wind-up (S,), rad, and its rate, rad/s, where there is an error of the transmission.
     An element that is a torque of its own, as that of a hysteresis, is beside them.
     """
     j, model = run.joint(place), run.model
@@ -78,9 +79,9 @@ def carried(run: Run, place: str) -> Callable[[State], np.ndarray]:
     springs = [(model.tendon_stiffness[i], *model.tendon_stiffnesspoly[i], *model.tendon_lengthspring[i]) for i in ids]
     damping = sum(model.tendon_damping[i] for i in ids)
 
-    def at(x: State) -> np.ndarray:
-        delta = x.q[:, j] - x.q_link[:, j]
-        total = damping * (x.v[:, j] - x.v_link[:, j])
+    def at(x: State, more: np.ndarray | float = 0.0, rate: np.ndarray | float = 0.0) -> np.ndarray:
+        delta = x.q[:, j] - x.q_link[:, j] + more
+        total = damping * (x.v[:, j] - x.v_link[:, j] + rate)
         for stiffness, second, third, low, high in springs:
             over = delta - np.clip(delta, low, high)
             total = total + over * (stiffness + over * (second + over * third))

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from robot_assets.robot import Robot
-from sim.effects.effect import Run, State, Torque
+from sim.effects.effect import Run, State, Torque, carried
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,13 @@ class TransmissionError:
     name = "transmission_error"
 
     def torque(self, run: Run) -> Callable[[State], Torque]:
-        j = run.joint(self.place)
-        k, d = run.drives["stiffness"][j], run.drives["damping"][j]
+        j, load = run.joint(self.place), carried(run, self.place)
 
         def step(x: State) -> Torque:
             angle = self.periods_per_rev * x.q[:, j] + self.phase
             slope = self.amplitude * self.periods_per_rev * np.cos(angle)
-            h = k * self.amplitude * np.sin(angle) + d * slope * x.v[:, j]
-            gear = k * (x.q[:, j] - x.q_link[:, j]) + d * (x.v[:, j] - x.v_link[:, j]) + h
+            gear = load(x, self.amplitude * np.sin(angle), slope * x.v[:, j])
+            h = gear - load(x)
             return Torque(j, -h - slope * gear, h)
 
         return step
