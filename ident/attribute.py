@@ -257,7 +257,7 @@ def pruned(problem: Problem, current: Fit) -> Fit:
         if pointless(effect):
             return True
         h = effect.hypothesis
-        own = [(q, v, std[f"{h.effect}@{h.place}:{q.name}"]) for q, v in zip(h.parameters, effect.p, strict=True) if not q.nuisance]
+        own = [(q, v, std[h.coordinate(q.name)]) for q, v in zip(h.parameters, effect.p, strict=True) if not q.nuisance]
         off = [abs(q.to_internal(v) - q.to_internal(q.null)) / s for q, v, s in own if q.null is not None]
         # The wave number of a wave that is not there may look sure.
         wave = is_wave(h.parameters)
@@ -384,7 +384,7 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
         if h.key in kept or special is None or "apart" not in h.options:
             return effect
         hidden = h.options.get("give", lambda p: np.inf)(effect.p) < problem.q_std[h.joint]
-        if std[f"{h.effect}@{h.place}:{h.options['apart']}"] < UNTOLD and not hidden:
+        if std[h.coordinate(h.options['apart'])] < UNTOLD and not hidden:
             return effect
         return Effect(special, clip_to_bounds(special, h.options["special"](effect.p)))
 

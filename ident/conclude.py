@@ -259,7 +259,7 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
     out: dict[str, Value] = {}
     std = {}
     for q, v in zip(h.parameters, effect.p, strict=True):
-        i = index[f"{h.effect}@{h.place}:{q.name}"]
+        i = index[h.coordinate(q.name)]
         s = float(np.sqrt(max(covariance[i, i], 0.0)))
         std[q.name] = s * abs(v) if q.log else s
         if q.reported or not q.nuisance:

@@ -265,7 +265,7 @@ def coordinate_names(model: Model) -> tuple[str, ...]:
     names = [*parameter_names(model.structure.robot), "timing"]
     for effect in model.effects:
         h = effect.hypothesis
-        names += [f"{h.effect}@{h.place}:{p.name}" for p in h.parameters]
+        names += [h.coordinate(p.name) for p in h.parameters]
     return tuple(names)
 
 

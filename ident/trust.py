@@ -83,7 +83,7 @@ def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
     h = effect.hypothesis
     if "shown" not in h.options:
         return True
-    i = final.names.index(f"{h.effect}@{h.place}:{h.options['shown']}")
+    i = final.names.index(h.coordinate(h.options["shown"]))
     return bool(covariance[i, i] < UNTOLD**2)
 
 

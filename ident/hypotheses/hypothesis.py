@@ -143,6 +143,10 @@ class Hypothesis:
     def key(self) -> tuple[str, str]:
         return self.effect, self.place
 
+    def coordinate(self, parameter: str) -> str:
+        """Name of one of its parameters among all coordinates of a fit."""
+        return f"{self.effect}@{self.place}:{parameter}"
+
     @property
     def gear_law(self) -> bool:
         """Whether it is a law of the gear's torque on its deflection, as an error of its transmission is not."""
