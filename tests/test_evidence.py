@@ -19,16 +19,17 @@ from ident.attribute import (
     with_name,
 )
 from ident.baseline import astray
-from ident.conclude import faint_note
+from ident.conclude import conclude, faint_note
 from ident.diagnose import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
 from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
+from ident.parallel import Workers
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.search import STRONG, choose, matched, other_bodies, polish, refit
+from ident.search import PER_EFFECT, STRONG, choose, explore, matched, other_bodies, polish, refit
 from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
@@ -368,6 +369,36 @@ def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
     assert other_bodies(found, tried, scores) == [scores[3]]
     better = [*found, (rub.hypothesis, SimpleNamespace(cost=0.5))]
     assert other_bodies(better, tried, scores) == [] == other_bodies([], tried, scores)
+
+
+def test_a_search_tries_other_bodies_where_one_answers_best(ur10, named, tmp_path):
+    """Of the links that could make up for a wrist that is too heavy more than two are refitted."""
+    heavy = parse_effect("link_inertia@wrist_1_link:mass=1.2", ur10)
+    plan = small_plan(ur10, 3, points=2, levels=(1.0,), validation_points=0)
+    setup, result = identify(through_files(run_experiment(plan, [heavy], seed=3), tmp_path))
+    bodies, told = [h for h in named.values() if "body" in h.options], []
+    explore(setup.problem, result, bodies, 0.0, np.inf, Workers(progress=told.append))
+    assert sum("refit: link_inertia" in text for text in told) > PER_EFFECT
+
+
+def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
+    """Of a discrepancy that is more than chance, and of an effect that the data do not show."""
+    data, setup, result = identified
+    problem = setup.problem
+    preds = predictions(problem, result.model, result.remainders)
+    quiet = Attribution(result, False, 1e-14, (), result, False)
+    assert any("p = 1e-14" in note for note in conclude(data, problem, (), result, quiet, None, preds, preds).notes)
+    h = named["hysteresis", "elbow_joint"]
+    final = refit(problem, replace(result.model, effects=(Effect(h, np.array([1e3, 1e4, 5.0, 0.0])),)), result.weights, result.remainders)
+    worse = replace(result, costs=1e3 * result.costs)
+    found = Round(worse, (Candidate(h, final, 0.0, 1.0),), (), 1.0, 1.0)
+    heard = Attribution(worse, True, 0.0, (found,), final, False)
+    given = []
+    for there in (True, False):
+        monkeypatch.setattr("ident.conclude.shown", lambda *args, there=there: there)
+        (cause,) = conclude(data, problem, (), worse, heard, None, preds, preds).causes
+        given.append(cause.probability)
+    assert given[0] > 0.9 and given[1] < 0.5
 
 
 @pytest.mark.parametrize(("std", "trusted"), [(0.02, True), (1.5, False)])
