@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from robot_assets.robot import Robot
-from sim.effects.effect import Run, State, Torque
+from sim.effects.effect import Dry, Run, State, Torque
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class PostureFriction:
     centre: float
     name = "outside:posture_friction"
 
-    def torque(self, run: Run) -> Callable[[State], Torque]:
+    def dry(self, run: Run) -> Callable[[State], Dry]:
         j = run.joint(self.place)
 
-        def step(x: State) -> Torque:
+        def step(x: State) -> Dry:
             size = self.slope * np.abs(x.q[:, j] - self.centre)
-            return Torque(j, -size * np.tanh(x.v[:, j] / 1e-3))
+            return Dry(j, size, size)
 
         return step
 

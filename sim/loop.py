@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from mujoco.batch import Batch
 
+from sim.effects.dry import resistance
 from sim.effects.effect import Run, State
-from sim.plant import Plant, without_engine_log
+from sim.plant import Plant, free_inertia, without_engine_log
 
 FARTHEST = 50.0  # rad or m: beyond, a simulation has diverged
 
@@ -75,15 +76,20 @@ def run_loop(
     batch = Batch(plant.model, S, nthread=2)
     x, v, force = batch.bind("qpos"), batch.bind("qvel"), batch.bind("qfrc_applied")
     x[:] = qpos
-    run = Run(S, h, 1 / sample_rate, plant.robot, plant.drives, plant.model, start)
+    inertia = free_inertia(plant, qpos)
+    run = Run(
+        S, h, 1 / sample_rate, plant.robot, plant.drives, plant.model, start, inertia[:, plant.motor], inertia[:, plant.link]
+    )
     torques = [e.torque(run) for e in plant.effects if callable(getattr(e, "torque", None))]
+    dry = [e.dry(run) for e in plant.effects if hasattr(e, "dry")]
+    resist = resistance(run, dry)
     deliver = [(run.joint(e.place), e.deliver(run)) for e in plant.effects if hasattr(e, "deliver")]
     measure = [
         (run.joint(e.place), getattr(e, "channel", "q"), getattr(e, "after_noise", False), e.measure(run))
         for e in plant.effects
         if hasattr(e, "measure")
     ]
-    fine = bool(torques or deliver or any(not late for _, _, late, _ in measure))
+    fine = bool(torques or dry or deliver or any(not late for _, _, late, _ in measure))
     m, a = plant.motor, plant.link
     tau, q, q_link = (np.empty((S, samples, n)) for _ in range(3))
     integral = np.zeros((S, n))
@@ -117,7 +123,7 @@ def run_loop(
             batch.step(nstep=substeps)
         else:
             for i in range(substeps):
-                v_old = _fine_step(batch, x, v, force, plant, u, k * substeps + i, run, torques, deliver, v_old)
+                v_old = _fine_step(batch, x, v, force, plant, u, k * substeps + i, run, torques, resist, deliver, v_old)
                 for j, channel, late, step in measure:
                     if not late:
                         now = x[:, m[j]] if channel == "q" else x[:, a[j]]
@@ -147,6 +153,7 @@ def _fine_step(
     index: int,
     run: Run,
     torques: list,
+    resist: Callable,
     deliver: list,
     v_old: np.ndarray,
 ) -> np.ndarray:
@@ -174,6 +181,8 @@ def _fine_step(
         torque = step(state)
         force[:, m[torque.joint]] += torque.motor
         force[:, a[torque.joint]] += torque.link
+    for friction, against in resist(state):
+        force[:, (a if friction.link else m)[friction.joint]] += against
     batch.step(nstep=1)
     return now
 

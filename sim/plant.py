@@ -162,6 +162,19 @@ def link_inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:
     return np.diag(M)[plant.link] + plant.drives["motor_inertia"]
 
 
+def free_inertia(plant: Plant, qpos: np.ndarray) -> np.ndarray:
+    """(S, nv) inertia that a torque at each coordinate meets with all others free, in each state (S, nq), kg m2."""
+    data = mujoco.MjData(plant.model)
+    out = np.empty((len(qpos), plant.model.nv))
+    M = np.zeros((plant.model.nv, plant.model.nv))
+    for i, x in enumerate(qpos):
+        data.qpos[:] = x
+        mujoco.mj_forward(plant.model, data)
+        mujoco.mj_fullM(plant.model, data, M)
+        out[i] = 1.0 / np.diag(np.linalg.pinv(M, hermitian=True))
+    return out
+
+
 def gravity_torque(plant: Plant, q: np.ndarray) -> np.ndarray:
     """(n,) torque that holds the links at rest in a posture, stiff gears, N m."""
     data = mujoco.MjData(plant.model)

@@ -3,15 +3,24 @@
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from robot_assets.urdf import read_urdf
 from sim import EFFECTS, draw_effect, parse_effect, run_experiment
 from sim.effects import make_effect, parameters_of, valid_places
+from sim.effects.dry import turn
 from sim.effects.effect import Run, State, carried
 from sim.plant import build_plant, gravity_torque, rest
 from tests.conftest import small_plan
+
+
+def run_of(plant):
+    """A run of one simulation in steps of 0.1 ms."""
+    inertia = np.ones((1, plant.robot.n))
+    return Run(1, 1e-4, 1e-3, plant.robot, plant.drives, plant.model, np.zeros(1), inertia, inertia)
 
 
 def test_rest_sags_by_torque_over_stiffness(ur10):
@@ -32,7 +41,7 @@ def test_friction_by_load_sees_all_that_the_gear_carries(ur10, hidden):
     effects = [] if hidden is None else [parse_effect(f"{hidden.split(':')[0]}@{place}:{hidden.split(':')[1]}", ur10)]
     plant = build_plant(ur10, effects)
     j, data = ur10.joint_names.index(place), mujoco.MjData(plant.model)
-    load = carried(Run(1, 1e-4, 1e-3, ur10, plant.drives, plant.model, np.zeros(1)), place)
+    load = carried(run_of(plant), place)
     for wind_up, rate in ((2e-4, 0.0), (-3e-3, 0.2), (4e-3, -0.1)):
         data.qpos[plant.motor[j]], data.qvel[plant.motor[j]] = wind_up, rate
         mujoco.mj_forward(plant.model, data)
@@ -50,7 +59,7 @@ def test_an_error_of_the_transmission_goes_through_the_law_of_the_gear(ur10):
     j, rest_of = ur10.joint_names.index(place), np.zeros((1, ur10.n))
     q, v = rest_of.copy(), rest_of.copy()
     q[0, j], v[0, j] = 3e-3, 0.2
-    torque = effects[1].torque(Run(1, 1e-4, 1e-3, ur10, plant.drives, plant.model, np.zeros(1)))(State(np.zeros(1), q, v, rest_of, rest_of, q, v, rest_of))
+    torque = effects[1].torque(run_of(plant))(State(np.zeros(1), q, v, rest_of, rest_of, q, v, rest_of))
     k, d = (plant.drives[x][j] for x in ("stiffness", "damping"))
     error, slope = size * np.sin(n * 3e-3 + 0.3), size * n * np.cos(n * 3e-3 + 0.3)
 
@@ -60,6 +69,24 @@ def test_an_error_of_the_transmission_goes_through_the_law_of_the_gear(ur10):
     whole, spring = law(3e-3 + error, 0.2 * (1.0 + slope)), law(3e-3, 0.2)
     assert torque.link == pytest.approx([whole - spring], rel=1e-9)
     assert torque.motor == pytest.approx([spring - whole - slope * whole], rel=1e-9)
+
+
+@given(st.floats(-1e4, 1e4), st.floats(0.0, 1e4))
+def test_the_turn_of_a_dry_friction_is_solved(asked, size):
+    x = turn(np.array([asked]), np.array([size]))
+    assert x + size * np.tanh(x) == pytest.approx(asked, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("hidden", ["coulomb_friction@wrist_2_joint:torque=4,asymmetry=0.2", "dress_pack@wrist_2_joint:stiffness=5,friction=4"])
+def test_dry_friction_does_not_depend_on_the_step(ur10, hidden):
+    """A wrist that creeps within the turn of its friction, which the step passes many times: a fine step says the same."""
+    plan = small_plan(ur10, 1, points=1, levels=(0.2,), validation_points=0, period=300, periods=2, band_hz=(4.0, 40.0))
+    free, coarse, fine = (
+        np.stack([s.q[:, 4] for s in run_experiment(plan, effects, noise=0.0, timestep=step).segments])
+        for effects, step in (([], 1e-4), ([parse_effect(hidden, ur10)], 2.5e-4), ([parse_effect(hidden, ur10)], 2.5e-5))
+    )
+    assert np.std(coarse - fine) < 0.01 * np.std(free - fine)
+    assert np.std(np.diff(coarse) * 1e3) < 0.05  # rad/s
 
 
 def test_two_masses_resonate_where_they_should():

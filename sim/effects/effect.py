@@ -6,6 +6,7 @@ may define any of:
     hinges() -> sequence of Elasticity           extra hinges of the chain
     edit(spec, robot, drives)                    native MuJoCo elements
     torque(run) -> step(State) -> Torque         a torque at every integration step
+    dry(run) -> step(State) -> Dry               the size of a dry friction at every step (see ``dry``)
     deliver(run) -> step(u, State) -> u          what becomes of the commanded torque
     measure(run) -> step(State) -> (S,) rad      what the encoder shows of its joint
 """
@@ -23,7 +24,10 @@ from robot_assets.robot import Robot
 
 @dataclass(frozen=True)
 class Run:
-    """A run: number of simulations S, integration step h (s), sample time (s), compiled model, start times (S,)."""
+    """A run: number of simulations S, integration step h (s), sample time (s), compiled model, start times (S,).
+
+    ``motor_inertia``, ``link_inertia`` (S, n): what a torque at these coordinates moves at the start, gears as springs, kg m2.
+    """
 
     simulations: int
     step: float
@@ -32,6 +36,8 @@ class Run:
     drives: dict[str, np.ndarray]
     model: mujoco.MjModel
     start: np.ndarray
+    motor_inertia: np.ndarray
+    link_inertia: np.ndarray
 
     def joint(self, name: str) -> int:
         return self.robot.joint_names.index(name)
@@ -62,6 +68,16 @@ class Torque:
     joint: int
     motor: np.ndarray | float = 0.0
     link: np.ndarray | float = 0.0
+
+
+@dataclass(frozen=True)
+class Dry:
+    """Dry friction of one joint: what it takes, each (S,) N m, to move forward and backward; at the motor or at the link."""
+
+    joint: int
+    forward: np.ndarray | float
+    backward: np.ndarray | float
+    link: bool = False
 
 
 GEAR_SPRINGS = "gear", "outer"  # tendons of a joint that carry torque from its motor to its link

@@ -7,13 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.effects.effect import Run, State, Torque, carried
-
-REVERSAL = 1e-3  # rad/s, velocity over which a regularised sign turns
-
-
-def smooth_sign(v: np.ndarray) -> np.ndarray:
-    return np.tanh(v / REVERSAL)
+from sim.effects.effect import Dry, Run, State, Torque, carried
 
 
 @dataclass(frozen=True)
@@ -25,14 +19,9 @@ class CoulombFriction:
     asymmetry: float = 0.0
     name = "coulomb_friction"
 
-    def torque(self, run: Run) -> Callable[[State], Torque]:
-        j = run.joint(self.place)
-
-        def step(x: State) -> Torque:
-            s = smooth_sign(x.v[:, j])
-            return Torque(j, -self.torque_ * (s + self.asymmetry * np.abs(s)))
-
-        return step
+    def dry(self, run: Run) -> Callable[[State], Dry]:
+        dry = Dry(run.joint(self.place), self.torque_ * (1 + self.asymmetry), self.torque_ * (1 - self.asymmetry))
+        return lambda x: dry
 
 
 @dataclass(frozen=True)
@@ -45,13 +34,12 @@ class StribeckFriction:
     stribeck_velocity: float
     name = "stribeck_friction"
 
-    def torque(self, run: Run) -> Callable[[State], Torque]:
+    def dry(self, run: Run) -> Callable[[State], Dry]:
         j = run.joint(self.place)
 
-        def step(x: State) -> Torque:
-            v = x.v[:, j]
-            level = self.coulomb + (self.static - self.coulomb) * np.exp(-((v / self.stribeck_velocity) ** 2))
-            return Torque(j, -level * smooth_sign(v))
+        def step(x: State) -> Dry:
+            level = self.coulomb + (self.static - self.coulomb) * np.exp(-((x.v[:, j] / self.stribeck_velocity) ** 2))
+            return Dry(j, level, level)
 
         return step
 
@@ -88,11 +76,12 @@ class LoadDependentFriction:
     coefficient: float
     name = "load_dependent_friction"
 
-    def torque(self, run: Run) -> Callable[[State], Torque]:
+    def dry(self, run: Run) -> Callable[[State], Dry]:
         j, load = run.joint(self.place), carried(run, self.place)
 
-        def step(x: State) -> Torque:
-            return Torque(j, -self.coefficient * np.abs(load(x)) * smooth_sign(x.v[:, j]))
+        def step(x: State) -> Dry:
+            size = self.coefficient * np.abs(load(x))
+            return Dry(j, size, size)
 
         return step
 
@@ -110,10 +99,17 @@ class FrictionDrift:
     def torque(self, run: Run) -> Callable[[State], Torque]:
         j = run.joint(self.place)
         viscous = run.drives["viscous_friction"][j]
+        return lambda x: Torque(j, -viscous * x.v[:, j] * (self._factor(run, x) - 1))
 
-        def step(x: State) -> Torque:
-            v = x.v[:, j]
-            factor = 1 + self.relative_change * -np.expm1(-(run.start + x.time) / self.time_constant)
-            return Torque(j, -self.coulomb * smooth_sign(v) * factor - viscous * v * (factor - 1))
+    def dry(self, run: Run) -> Callable[[State], Dry]:
+        j = run.joint(self.place)
+
+        def step(x: State) -> Dry:
+            size = self.coulomb * self._factor(run, x)
+            return Dry(j, size, size)
 
         return step
+
+    def _factor(self, run: Run, x: State) -> np.ndarray:
+        """(S,) of the friction at that time."""
+        return 1 + self.relative_change * -np.expm1(-(run.start + x.time) / self.time_constant)

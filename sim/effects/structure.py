@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 
 from robot_assets.robot import Elasticity, Robot
-from sim.effects.effect import Run, State, Torque
-from sim.effects.friction import smooth_sign
+from sim.effects.effect import Dry, Run, State
 
 
 @dataclass(frozen=True)
@@ -107,6 +106,6 @@ class DressPack:
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
         spec.joint(f"link:{self.place}").stiffness = [self.stiffness, 0, 0]
 
-    def torque(self, run: Run) -> Callable[[State], Torque]:
-        j = run.joint(self.place)
-        return lambda x: Torque(j, 0.0, -self.friction * smooth_sign(x.v_link[:, j]))
+    def dry(self, run: Run) -> Callable[[State], Dry]:
+        dry = Dry(run.joint(self.place), self.friction, self.friction, link=True)
+        return lambda x: dry
