@@ -108,23 +108,21 @@ class Prediction:
         """(L, n) power that position noise leaves in the torque through laws at the motors, N2 m2.
 
         A friction that turns within a small velocity carries the noise of a motor that stands still
-        with the slope of the turn. By one draw of the noise over all records.
+        with the slope of the turn. By one draw, over all records, of what the motion that laws see is off.
         """
         out = np.zeros(self.U.shape[1:])
         at_motor = [e for e in self.model.effects if e.hypothesis.channel == "motor"]
         if not at_motor:
             return out
         rng = np.random.default_rng(0)
-        draw = rng.normal(size=(2, *self.U.shape)) * np.sqrt(0.5 * group.position_noise)
-        noisy = replace(self.solution, Q=self.solution.Q + draw[0] + 1j * draw[1])
+        draw = rng.normal(size=(2, *self.U.shape)) * np.sqrt(0.5 * group.shown_error)
         moving = replace(group, rest=None)  # at rest the noise of the position cancels
+        seen = Motion(moving, self.solution, self.par)
+        motions = replace(seen, error=draw[0] + 1j * draw[1]), seen
         for effect in at_motor:
             j = effect.hypothesis.joint
-            k = self.par.stiffness[j]
-            with_noise, without = (
-                effect.hypothesis.law(effect.p, Motion(moving, x, self.par), j, k) for x in (noisy, self.solution)
-            )
-            change = self.plane.record * self.motion(group).lines(with_noise - without)
+            off, as_seen = (effect.hypothesis.law(effect.p, x, j, self.par.stiffness[j]) for x in motions)
+            change = self.plane.record * self.motion(group).lines(off - as_seen)
             out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
         return out
 
@@ -189,6 +187,7 @@ def predict(
     return predict_at(model, structure, par, plane, group, sampling, W=W, steps=steps, torques=torques)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of torques that run away: those who ask see that the result is not finite
 def predict_at(
     model: Model,
     structure: Structure,

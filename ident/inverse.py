@@ -156,21 +156,23 @@ class Solution:
 class Motion:
     """Time signals of a solution, made where they are asked for; each (S, T) on the group's grid.
 
-    ``beside``: spectra (S, L, n) of what else acts at the motors, N m.
+    ``beside``: spectra (S, L, n) of what else acts at the motors, N m. ``error``: the same, rad, by which the position
+    that laws see is taken off.
     """
 
     group: Group
     solution: Solution
     par: Parameters
     beside: np.ndarray | float = 0.0
+    error: np.ndarray | float = 0.0
 
     def q(self, joint: int) -> np.ndarray:
         """Motor position without lines of noise alone, rad."""
-        return self._time(self.solution.Q, joint, share=self.group.signal_share[..., joint])
+        return self._shown(joint, 0)
 
     def v(self, joint: int) -> np.ndarray:
         """Motor velocity without lines of noise alone, rad/s."""
-        return self._time(self.solution.Q, joint, 1, self.group.signal_share[..., joint])
+        return self._shown(joint, 1)
 
     def acceleration(self, joint: int) -> np.ndarray:
         """Motor acceleration, rad/s2."""
@@ -228,6 +230,12 @@ class Motion:
     def lines(self, x: np.ndarray) -> np.ndarray:
         """Time signal (S, T) to spectrum (S, L)."""
         return self.group.to_lines(x[..., None])[..., 0]
+
+    def _shown(self, joint: int, order: int) -> np.ndarray:
+        x = self.group.signal_share[..., joint] * self.solution.Q[..., joint]
+        if isinstance(self.error, np.ndarray):
+            x = x + self.error[..., joint]
+        return self._time(x[..., None], 0, order)
 
     def _time(self, X: np.ndarray, column: int, order: int = 0, share: np.ndarray | float = 1.0) -> np.ndarray:
         x = share * X[..., column]

@@ -110,6 +110,19 @@ class Group:
         return _signal_share(self.Q, self.position_noise)
 
     @cached_property
+    def shown_error(self) -> np.ndarray:
+        """(S, L, n) power by which that motion is off, rad2: the noise it holds, and the signal it has lost.
+
+        By Stein's unbiased estimate (Stein 1981), whose own scatter a mean over lines near by takes away.
+        """
+        noise, power = self.position_noise, np.abs(self.Q) ** 2
+        least = SIGNAL_LEVEL * noise
+        risk = np.where(power > least, noise + least**2 / np.maximum(power, 1e-300), power - noise)
+        mean = mean_over_lines(risk.swapaxes(0, 1), NOISE_LINES).swapaxes(0, 1)
+        mean[:, 0] = 0.0
+        return np.maximum(mean, 0.0)
+
+    @cached_property
     def torque_share(self) -> np.ndarray:
         """(S, L, n) the same of the torque: a law that clips it would clip its noise, and so explain that."""
         return _signal_share(self.U, self.torque_noise)

@@ -383,7 +383,9 @@ def beside_strong(
     pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
-    strong += workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
+    told = workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
+    right = [r for (_, r), (h, _) in zip(along, told, strict=False) if not is_along_record(h)]
+    strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(h.joint, r, right))]
     if any(is_along_record(h) for h, _ in strong):
         whole = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
         strong = [(h, r) for h, r in strong if not (is_along_record(h) and matched(problem, h.joint, r, whole))]
@@ -433,6 +435,18 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
     cost = reweighted(problem, best, along.weights).costs[joint]
     noise = noise_costs(problem, best.weights, along.weights)[joint]
     return bool(left >= CLEARLY_BETTER * (cost - noise))
+
+
+def outdone_along(joint: int, along: Fit, right: Sequence[Fit]) -> bool:
+    """Whether a model along the record leaves no less at a joint than one along it whose law is right as a loop too.
+
+    What the record tells both of them is no merit of a law that is right along it alone.
+
+    Args:
+        right: fits along the record of models with such laws.
+    """
+    same = [r.costs[joint] for r in right if r.model.effects[-1].hypothesis.joint == joint]
+    return bool(same) and min(same) <= along.costs[joint]
 
 
 def under_own_noise(problem: Problem, result: Fit) -> Fit:

@@ -29,7 +29,7 @@ from ident.hypotheses.sensing import encoder_eccentricity
 from ident.parallel import Workers
 from ident.reporting import frf_views
 from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.search import PER_EFFECT, STRONG, choose, explore, matched, other_bodies, polish, refit
+from ident.search import PER_EFFECT, STRONG, choose, explore, matched, other_bodies, outdone_along, polish, refit
 from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
@@ -263,7 +263,7 @@ def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
 def test_a_motor_that_friction_holds_is_no_drive_that_saturates(tmp_path):
     """A limit near zero would deliver nothing, and so explain a motor that hardly moves."""
     robot = load_robot("twomass")
-    hidden = parse_effect("coulomb_friction@drive:torque=0.3", robot)
+    hidden = parse_effect("coulomb_friction@drive:torque=0.1", robot)
     data = run_experiment(small_plan(robot, 4, period=1000), [hidden], seed=4)
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
@@ -354,6 +354,17 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     # The same error in noise so large that it hides it is not less of an error.
     hidden = replace(wrong, weights=loud, costs=wrong.counts + 0.01 * (wrong.costs - wrong.counts))
     assert matched(problem, joint, hidden, [wrong])
+
+
+def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(identified, named):
+    """The record tells any law of the gear much; one that is right as a loop too is preferred where it is no worse along it."""
+    _, _, result = identified
+    own = Effect(named["hardening_stiffness", "elbow_joint"], np.array([1e9]))
+    right = replace(result, model=replace(result.model, effects=(own,)))
+    j = own.hypothesis.joint
+    worse, better = (replace(result, costs=f * result.costs) for f in (1.2, 0.8))
+    assert outdone_along(j, worse, [right]) and not outdone_along(j, better, [right])
+    assert not outdone_along(j - 1, worse, [right]) and not outdone_along(j, worse, [])
 
 
 def test_where_a_body_answers_best_those_near_it_are_tried_too(named):

@@ -10,7 +10,7 @@ from ident.dataset import Dataset, Segment
 from ident.diagnose import diagnose, set_up
 from ident.extended import Model, predict
 from ident.gain import mean_squares, stretch_squares
-from ident.records import close_motion
+from ident.records import build_groups, close_motion
 from ident.torque_fit import data_count, make_weights
 from robot_assets.robot import load_robot
 
@@ -116,3 +116,31 @@ def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     motion = predict(Model(setup.problem.structure, setup.problem.nominal), group, setup.problem.sampling).motion(group)
     assert np.abs(motion.torque(0)).max() > 1.5 * 3.0
     assert motion.peak_torque(0) == pytest.approx(3.0, rel=0.05)
+
+
+def test_what_laws_see_of_a_position_is_off_by_as_much_as_is_said():
+    """Lines from far above the noise to far below it, and none: the error of the motion shown to laws against its claim."""
+    bench, rng, n = load_robot("twomass"), np.random.default_rng(2), 2000
+    lines = np.arange(1, 200)
+    size = np.where(lines < 150, 1e-3 * np.exp(-lines / 18.0), 0.0)
+    noise, segments, truth = 1e-4, [], []
+    for i in range(24):
+        X = np.zeros(n // 2 + 1, complex)
+        X[lines] = size * (rng.normal(size=lines.size) + 1j * rng.normal(size=lines.size)) / np.sqrt(2)
+        q = np.tile(np.fft.irfft(X, n=n, norm="forward"), 3) + noise * rng.normal(size=3 * n)
+        truth.append(X)
+        segments.append(
+            Segment(
+                f"s{i}", "multisine", "identification", np.arange(3 * n) / RATE, 0.1 * rng.normal(size=(3 * n, 1)), q[:, None],
+                operating_point="a", q0=np.zeros(1), period=n, periods=3, excited_lines=np.arange(1, 100),
+            )
+        )  # fmt: skip
+    data = Dataset("lines", "twomass", bench, RATE, bench.joint_names, "zoh", np.array([noise]), np.array([0.1]), None, tuple(segments))
+    (group,) = build_groups(data)
+    K = group.Q.shape[1]
+    off = np.abs(group.signal_share * group.Q - np.stack(truth)[:, :K, None])[..., 0] ** 2
+    said = group.shown_error[..., 0]
+    for band in (slice(1, 40), slice(40, 70), slice(70, 110)):  # mostly signal, half and half, mostly noise
+        assert said[:, band].mean() == pytest.approx(off[:, band].mean(), rel=0.25)
+    alone = group.position_noise[165:].mean()
+    assert off[:, 165:].mean() < 0.1 * alone and said[:, 165:].mean() < 0.2 * alone
