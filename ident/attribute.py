@@ -51,6 +51,7 @@ SETTLED = 0.05  # share of the excess up to which what is left needs no second s
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record, from which its loop is begun
+LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave: a strong effect that is missing leaves more
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
@@ -119,7 +120,8 @@ def attribute(
         workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
         # What is left beside a cause is mostly what its law lacks, and no hinge.
         bare = np.inf if rounds else worth_a_hinge(current)
-        found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current), bare)
+        quiet = shadows(current, rounds)
+        found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current), bare, quiet)
         if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
             found = beside_unclear(problem, current, found, hypotheses, workers, bare)
         if not answers(found):
@@ -405,6 +407,7 @@ def attribute_once(
     workers: Workers,
     least: float,
     bare: float,
+    quiet: frozenset[int] = frozenset(),
 ) -> Round:
     """One round: screen all, refit the best, weigh them.
 
@@ -413,6 +416,7 @@ def attribute_once(
 
     Args:
         least, bare: as of ``search.explore``, from the model as it is.
+        quiet: joints at which no strong effect is sought.
     """
     before, softly = current, {}
     found, scores = explore(problem, current, hypotheses, least, bare, workers)
@@ -429,10 +433,18 @@ def attribute_once(
         before, ranked = under_noise_of_best(problem, before, ranked, workers)
     bent = bool(ranked) and ranked[0][0].options.get("bends", False)
     spoilt = not problem.motions_alone and (bent or implausible(problem, before))
-    allowed = DETECTION_EXCESS - 1.0 if spoilt else FAINT
-    if min(before.chi2_per_dof - 1.0, left_by(ranked) / before.count) > allowed and not told and not workers.late:
-        before, ranked = beside_strong(problem, before, ranked, scores, workers)
+    excess = before.cost - before.count
+    allowed = (DETECTION_EXCESS - 1.0) * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * excess)
+    if min(before.cost - before.count, left_by(ranked)) > allowed and not told and not workers.late:
+        before, ranked = beside_strong(problem, before, ranked, scores, workers, quiet)
     return weighed_round(before, ranked, scores, softly)
+
+
+def shadows(current: Fit, rounds: Sequence[Round]) -> frozenset[int]:
+    """Joints at which next to nothing is left beside what a cause there has explained: no strong one is missing."""
+    left = current.costs - current.counts
+    named = [(r.candidates[0].hypothesis.joint, r.before.costs - r.candidates[0].fit.costs) for r in rounds]
+    return frozenset(j for j, fall in named if j >= 0 and left[j] < LAW_ERROR * fall[j])
 
 
 def settles_its_joint(problem: Problem, current: Fit, h: Hypothesis, result: Fit) -> bool:

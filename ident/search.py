@@ -358,6 +358,7 @@ def beside_strong(
     ranked: Sequence[tuple[Hypothesis, Fit]],
     scores: Sequence[Score],
     workers: Workers,
+    quiet: frozenset[int] = frozenset(),
 ) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
     """Candidates, and the model without them, beside strong effects where one of those does better.
 
@@ -366,6 +367,9 @@ def beside_strong(
     Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
     gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
     as loops where these do as well.
+
+    Args:
+        quiet: joints at which none is sought.
     """
 
     def annealed(score: Score) -> Fit | None:
@@ -377,7 +381,7 @@ def beside_strong(
             return None
 
     likely = min(ranked, key=lambda x: x[1].cost)[0].joint if ranked else -1
-    chosen = strong_effects(problem, before, scores, likely)
+    chosen = [s for s in strong_effects(problem, before, scores, likely) if s.hypothesis.joint not in quiet]
     chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
     fits = workers.map_in_time(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
     pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]

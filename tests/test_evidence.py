@@ -16,6 +16,7 @@ from ident.attribute import (
     pruned,
     settled,
     settles_its_joint,
+    shadows,
     with_name,
 )
 from ident.baseline import astray
@@ -365,6 +366,18 @@ def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(ide
     worse, better = (replace(result, costs=f * result.costs) for f in (1.2, 0.8))
     assert outdone_along(j, worse, [right]) and not outdone_along(j, better, [right])
     assert not outdone_along(j - 1, worse, [right]) and not outdone_along(j, worse, [])
+
+
+def test_no_strong_effect_is_sought_where_a_cause_has_left_next_to_nothing(identified, named):
+    """Half a per cent of what a cause explains is an error of its law; two per cent may be another cause; its joint alone."""
+    _, _, result = identified
+    j, h = 2, named["coulomb_friction", "elbow_joint"]
+    winner = replace(result, costs=result.counts.copy())
+    before = replace(result, costs=winner.costs + 1e5 * (np.arange(result.counts.size) == j))
+    found = Round(before, (Candidate(h, winner, 1.0),), (), 1.0, 1.0)
+    left = [replace(result, costs=result.counts + share * 1e5) for share in (0.005, 0.02)]
+    assert [shadows(x, [found]) for x in left] == [{j}, frozenset()]
+    assert shadows(left[0], []) == frozenset()
 
 
 def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
