@@ -51,7 +51,7 @@ SETTLED = 0.05  # share of the excess up to which what is left needs no second s
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record, from which its loop is begun
-LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave: a strong effect that is missing leaves more
+LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave: what is that small is left to linear steps
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
@@ -120,7 +120,7 @@ def attribute(
         workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
         # What is left beside a cause is mostly what its law lacks, and no hinge.
         bare = np.inf if rounds else worth_a_hinge(current)
-        quiet = shadows(current, rounds)
+        quiet = shadows(problem, current, rounds)
         found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current), bare, quiet)
         if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
             found = beside_unclear(problem, current, found, hypotheses, workers, bare)
@@ -440,11 +440,15 @@ def attribute_once(
     return weighed_round(before, ranked, scores, softly)
 
 
-def shadows(current: Fit, rounds: Sequence[Round]) -> frozenset[int]:
-    """Joints at which next to nothing is left beside what a cause there has explained: no strong one is missing."""
+def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozenset[int]:
+    """Joints at which next to nothing is left beside what a cause there has explained, all in the noise of the model as it is."""
     left = current.costs - current.counts
-    named = [(r.candidates[0].hypothesis.joint, r.before.costs - r.candidates[0].fit.costs) for r in rounds]
-    return frozenset(j for j, fall in named if j >= 0 and left[j] < LAW_ERROR * fall[j])
+    out = set()
+    for found in rounds:
+        j = found.candidates[0].hypothesis.joint
+        if j >= 0 and left[j] < LAW_ERROR * (reweighted(problem, found.before, current.weights).costs[j] - current.costs[j]):
+            out.add(j)
+    return frozenset(out)
 
 
 def settles_its_joint(problem: Problem, current: Fit, h: Hypothesis, result: Fit) -> bool:

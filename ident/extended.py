@@ -105,7 +105,7 @@ class Prediction:
         return self.plane.record[:, None, None] * Z
 
     def law_noise(self, group: Group) -> np.ndarray:
-        """(L, n) power that position noise leaves in the torque through laws at the motors, N2 m2.
+        """(L, n) power that the error of the motion shown to laws at the motors leaves in the torque, N2 m2.
 
         A friction that turns within a small velocity carries the noise of a motor that stands still
         with the slope of the turn. By one draw, over all records, of what the motion that laws see is off.

@@ -113,11 +113,13 @@ class Group:
     def shown_error(self) -> np.ndarray:
         """(S, L, n) power by which that motion is off, rad2: the noise it holds, and the signal it has lost.
 
-        By Stein's unbiased estimate (Stein 1981), whose own scatter a mean over lines near by takes away.
+        By Stein's unbiased estimate (Stein 1981), in the mean over lines near by, which takes away most of its own scatter; what
+        is below zero then counts as none.
         """
         noise, power = self.position_noise, np.abs(self.Q) ** 2
         least = SIGNAL_LEVEL * noise
         risk = np.where(power > least, noise + least**2 / np.maximum(power, 1e-300), power - noise)
+        risk[:, 0] = noise[0]  # the mean is shown as it is
         mean = mean_over_lines(risk.swapaxes(0, 1), NOISE_LINES).swapaxes(0, 1)
         mean[:, 0] = 0.0
         return np.maximum(mean, 0.0)

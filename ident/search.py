@@ -381,7 +381,7 @@ def beside_strong(
             return None
 
     likely = min(ranked, key=lambda x: x[1].cost)[0].joint if ranked else -1
-    chosen = [s for s in strong_effects(problem, before, scores, likely) if s.hypothesis.joint not in quiet]
+    chosen = strong_effects(problem, before, scores, likely, quiet)
     chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
     fits = workers.map_in_time(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
     pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
@@ -389,7 +389,7 @@ def beside_strong(
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
     told = workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
     right = [r for (_, r), (h, _) in zip(along, told, strict=False) if not is_along_record(h)]
-    strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(h.joint, r, right))]
+    strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(problem, h.joint, r, right))]
     if any(is_along_record(h) for h, _ in strong):
         whole = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
         strong = [(h, r) for h, r in strong if not (is_along_record(h) and matched(problem, h.joint, r, whole))]
@@ -402,16 +402,20 @@ def beside_strong(
     return under_noise_of_best(problem, before, [*best.values(), *others], workers)
 
 
-def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], likely: int) -> list[Score]:
+def strong_effects(
+    problem: Problem, stage: Fit, scores: Sequence[Score], likely: int, quiet: frozenset[int] = frozenset()
+) -> list[Score]:
     """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
+
+    None at joints that are ``quiet``.
 
     A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
     of the time hardly shows its inertia: the linear step of a score says little about either. Motions below the
     resonances hardly show the gears.
     """
     preds = predictions(problem, stage.model, stage.remainders)
-    loudest = int(np.argmax(stage.costs))
-    scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} if j >= 0}
+    loudest = max(set(range(len(stage.costs))) - quiet, key=lambda j: stage.costs[j], default=-1)
+    scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} - quiet if j >= 0}
     return [
         replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))
         for s in scores
@@ -441,16 +445,21 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
     return bool(left >= CLEARLY_BETTER * (cost - noise))
 
 
-def outdone_along(joint: int, along: Fit, right: Sequence[Fit]) -> bool:
+def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]) -> bool:
     """Whether a model along the record leaves no less at a joint than one along it whose law is right as a loop too.
 
-    What the record tells both of them is no merit of a law that is right along it alone.
+    What the record tells both of them is no merit of a law that is right along it alone. Both are seen in the noise of the
+    former, each less what its own noise is in those units, as in ``matched``.
 
     Args:
         right: fits along the record of models with such laws.
     """
-    same = [r.costs[joint] for r in right if r.model.effects[-1].hypothesis.joint == joint]
-    return bool(same) and min(same) <= along.costs[joint]
+    left = max(along.costs[joint] - along.counts[joint], 0.0)
+    others = [r for r in right if r.model.effects[-1].hypothesis.joint == joint]
+    return any(
+        reweighted(problem, r, along.weights).costs[joint] - noise_costs(problem, r.weights, along.weights)[joint] <= left
+        for r in others
+    )
 
 
 def under_own_noise(problem: Problem, result: Fit) -> Fit:

@@ -164,14 +164,14 @@ def link_inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:
 
 def free_inertia(plant: Plant, qpos: np.ndarray) -> np.ndarray:
     """(S, nv) inertia that a torque at each coordinate meets with all others free, in each state (S, nq), kg m2."""
-    data = mujoco.MjData(plant.model)
-    out = np.empty((len(qpos), plant.model.nv))
-    M = np.zeros((plant.model.nv, plant.model.nv))
+    data, nv = mujoco.MjData(plant.model), plant.model.nv
+    out, unit = np.empty((len(qpos), nv)), np.eye(nv)
     for i, x in enumerate(qpos):
         data.qpos[:] = x
         mujoco.mj_forward(plant.model, data)
-        mujoco.mj_fullM(plant.model, data, M)
-        out[i] = 1.0 / np.diag(np.linalg.pinv(M, hermitian=True))
+        moved = np.empty((nv, nv))
+        mujoco.mj_solveM(plant.model, data, moved, unit)
+        out[i] = 1.0 / np.diag(moved)
     return out
 
 

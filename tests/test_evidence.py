@@ -29,8 +29,20 @@ from ident.hypotheses.hypothesis import LOG_SPREAD
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.parallel import Workers
 from ident.reporting import frf_views
-from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums
-from ident.search import PER_EFFECT, STRONG, choose, explore, matched, other_bodies, outdone_along, polish, refit
+from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums, screen
+from ident.search import (
+    PER_EFFECT,
+    STRONG,
+    choose,
+    explore,
+    matched,
+    other_bodies,
+    outdone_along,
+    polish,
+    refit,
+    reweighted,
+    strong_effects,
+)
 from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
@@ -45,6 +57,7 @@ from ident.torque_fit import (
 )
 from ident.trust import shadowed, shown
 from ident.verdict import Gain
+from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from tests.conftest import small_plan, through_files
@@ -261,7 +274,7 @@ def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
     assert _noise(replace(data, segments=(noisy,), q_std=None, tau_std=None))[1] == pytest.approx(1.0, rel=0.1)
 
 
-def test_a_motor_that_friction_holds_is_no_drive_that_saturates(tmp_path):
+def test_a_motor_that_creeps_in_its_friction_is_no_drive_that_saturates(tmp_path):
     """A limit near zero would deliver nothing, and so explain a motor that hardly moves."""
     robot = load_robot("twomass")
     hidden = parse_effect("coulomb_friction@drive:torque=0.1", robot)
@@ -269,6 +282,13 @@ def test_a_motor_that_friction_holds_is_no_drive_that_saturates(tmp_path):
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
     assert all(c.probability < 0.5 for c in verdict.causes if c.effect != "coulomb_friction")
+
+
+def test_a_motor_that_friction_holds_altogether_is_said_not_to_move(tmp_path):
+    robot = load_robot("twomass")
+    data = run_experiment(small_plan(robot, 4, period=1000), [parse_effect("coulomb_friction@drive:torque=0.3", robot)], seed=4)
+    with pytest.raises(DataError, match="no joint that moves"):
+        diagnose(through_files(data, tmp_path))
 
 
 def test_an_offset_of_a_torque_record_is_no_spring(clean, tmp_path):
@@ -359,25 +379,45 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
 
 def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(identified, named):
     """The record tells any law of the gear much; one that is right as a loop too is preferred where it is no worse along it."""
-    _, _, result = identified
-    own = Effect(named["hardening_stiffness", "elbow_joint"], np.array([1e9]))
-    right = replace(result, model=replace(result.model, effects=(own,)))
-    j = own.hypothesis.joint
-    worse, better = (replace(result, costs=f * result.costs) for f in (1.2, 0.8))
-    assert outdone_along(j, worse, [right]) and not outdone_along(j, better, [right])
-    assert not outdone_along(j - 1, worse, [right]) and not outdone_along(j, worse, [])
+    _, setup, result = identified
+    problem = setup.problem
+    own = Effect(named["hardening_stiffness", "elbow_joint"], np.array([1.0]))
+    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([5.0, 0.0, 1e-3]))
+    right, wrong = (replace(result, model=replace(result.model, effects=e)) for e in ((own,), (rub, own)))
+    j, loud = own.hypothesis.joint, scaled(result.weights, 10.0)
+    along = replace(result, weights=loud, costs=1.05 * result.counts)
+    assert outdone_along(problem, j, along, [wrong, right])
+    assert not outdone_along(problem, j, along, [wrong]) and not outdone_along(problem, j, along, [])
+    assert not outdone_along(problem, j - 1, along, [right])
 
 
 def test_no_strong_effect_is_sought_where_a_cause_has_left_next_to_nothing(identified, named):
     """Half a per cent of what a cause explains is an error of its law; two per cent may be another cause; its joint alone."""
-    _, _, result = identified
-    j, h = 2, named["coulomb_friction", "elbow_joint"]
-    winner = replace(result, costs=result.counts.copy())
-    before = replace(result, costs=winner.costs + 1e5 * (np.arange(result.counts.size) == j))
-    found = Round(before, (Candidate(h, winner, 1.0),), (), 1.0, 1.0)
-    left = [replace(result, costs=result.counts + share * 1e5) for share in (0.005, 0.02)]
-    assert [shadows(x, [found]) for x in left] == [{j}, frozenset()]
-    assert shadows(left[0], []) == frozenset()
+    _, setup, result = identified
+    problem, j = setup.problem, 2
+    h = named["coulomb_friction", "elbow_joint"]
+    rub = replace(result.model, effects=(Effect(h, np.array([5.0, 0.0, 1e-3])),))
+    # Data without friction: a model with one has the discrepancy, and costs in another noise say nothing.
+    before = replace(result, model=rub, costs=0.0 * result.costs)
+    found = Round(before, (Candidate(h, result, 1.0),), (), 1.0, 1.0)
+    fall = reweighted(problem, before, result.weights).costs[j] - result.costs[j]
+    left = [replace(result, costs=result.counts + share * fall * (np.arange(result.counts.size) == j)) for share in (0.005, 0.02)]
+    assert fall > 100 * result.counts[j]
+    assert [shadows(problem, x, [found]) for x in left] == [{j}, frozenset()]
+    assert shadows(problem, left[0], []) == frozenset()
+
+
+def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identified):
+    _, setup, result = identified
+    problem = setup.problem
+    scores = screen(problem, result, predictions(problem, result.model, result.remainders), catalogue(problem.structure))
+    stage = replace(result, costs=result.counts * np.array([1.0, 3.0, 9.0, 1.0, 1.0, 1.0]))
+
+    def joints(likely: int, quiet: set[int]) -> set[int]:
+        return {s.hypothesis.joint for s in strong_effects(problem, stage, scores, likely, frozenset(quiet))}
+
+    assert joints(4, set()) == {2, 4} and joints(4, {2}) == {1, 4} and joints(2, {2}) == {1}
+    assert joints(4, set(range(6))) == set()
 
 
 def test_where_a_body_answers_best_those_near_it_are_tried_too(named):

@@ -11,8 +11,8 @@ from robot_assets.robot import load_robot
 from robot_assets.urdf import read_urdf
 from sim import EFFECTS, draw_effect, parse_effect, run_experiment
 from sim.effects import make_effect, parameters_of, valid_places
-from sim.effects.dry import turn
-from sim.effects.effect import Run, State, carried
+from sim.effects.dry import REVERSAL, resistance, turn
+from sim.effects.effect import Dry, Run, State, carried
 from sim.plant import build_plant, gravity_torque, rest
 from tests.conftest import small_plan
 
@@ -87,6 +87,21 @@ def test_dry_friction_does_not_depend_on_the_step(ur10, hidden):
     )
     assert np.std(coarse - fine) < 0.01 * np.std(free - fine)
     assert np.std(np.diff(coarse) * 1e3) < 0.05  # rad/s
+
+
+def test_a_motor_thrown_into_friction_comes_to_rest(ur10):
+    """Without other torque: the friction of a step is twenty times what turns its sign, and no velocity is left but of the turn."""
+    h, start = 1e-4, 0.01
+    run = run_of(build_plant(ur10))
+    size = 20.0 * REVERSAL * 2.0 / h
+    resist = resistance(run, [lambda x: Dry(0, size, size)])
+    v, old = np.full((1, ur10.n), start), np.full((1, ur10.n), start)
+    for _ in range(40):
+        mid = 1.5 * v - 0.5 * old
+        ((_, torque),) = resist(State(np.zeros(1), v, mid, v, mid, v, v, v))
+        old = v.copy()
+        v[:, 0] += h * torque
+    assert abs(v[0, 0]) < 1e-6 * start
 
 
 def test_two_masses_resonate_where_they_should():

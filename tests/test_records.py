@@ -8,8 +8,9 @@ import pytest
 
 from ident.dataset import Dataset, Segment
 from ident.diagnose import diagnose, set_up
-from ident.extended import Model, predict
+from ident.extended import Effect, Model, predict
 from ident.gain import mean_squares, stretch_squares
+from ident.hypotheses import catalogue
 from ident.records import build_groups, close_motion
 from ident.torque_fit import data_count, make_weights
 from robot_assets.robot import load_robot
@@ -118,8 +119,8 @@ def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     assert motion.peak_torque(0) == pytest.approx(3.0, rel=0.05)
 
 
-def test_what_laws_see_of_a_position_is_off_by_as_much_as_is_said():
-    """Lines from far above the noise to far below it, and none: the error of the motion shown to laws against its claim."""
+def periodic_positions():
+    """Records of the two masses whose lines fall from far above the noise to far below it, and none beyond; and their truth."""
     bench, rng, n = load_robot("twomass"), np.random.default_rng(2), 2000
     lines = np.arange(1, 200)
     size = np.where(lines < 150, 1e-3 * np.exp(-lines / 18.0), 0.0)
@@ -137,10 +138,29 @@ def test_what_laws_see_of_a_position_is_off_by_as_much_as_is_said():
         )  # fmt: skip
     data = Dataset("lines", "twomass", bench, RATE, bench.joint_names, "zoh", np.array([noise]), np.array([0.1]), None, tuple(segments))
     (group,) = build_groups(data)
-    K = group.Q.shape[1]
-    off = np.abs(group.signal_share * group.Q - np.stack(truth)[:, :K, None])[..., 0] ** 2
+    return data, group, np.stack(truth)[:, : group.Q.shape[1], None]
+
+
+def test_what_laws_see_of_a_position_is_off_by_as_much_as_is_said():
+    """The error of the motion shown to laws against its claim, line by line."""
+    _, group, truth = periodic_positions()
+    off = np.abs(group.signal_share * group.Q - truth)[..., 0] ** 2
     said = group.shown_error[..., 0]
     for band in (slice(1, 40), slice(40, 70), slice(70, 110)):  # mostly signal, half and half, mostly noise
         assert said[:, band].mean() == pytest.approx(off[:, band].mean(), rel=0.25)
     alone = group.position_noise[165:].mean()
     assert off[:, 165:].mean() < 0.1 * alone and said[:, 165:].mean() < 0.2 * alone
+
+
+@pytest.mark.parametrize("smoothing", [2e-3, 1e-2])
+def test_what_that_leaves_in_a_friction_is_what_is_said(smoothing):
+    """The torque of a friction along the motion shown to it, against that along the true one."""
+    data, group, truth = periodic_positions()
+    problem = set_up(data).problem
+    (friction,) = [h for h in catalogue(problem.structure) if h.effect == "coulomb_friction"]
+    effect = Effect(friction, np.array([1.0, 0.0, smoothing]))
+    seen = predict(Model(problem.structure, problem.nominal, (effect,)), group, problem.sampling)
+    motion = seen.motion(group)
+    exact = replace(motion, error=truth - group.signal_share * seen.solution.Q)
+    off = motion.lines(friction.law(effect.p, motion, 0, 0.0) - friction.law(effect.p, exact, 0, 0.0))
+    assert np.mean(seen.law_noise(group)) / np.mean(np.abs(off) ** 2) == pytest.approx(1.0, abs=0.3)

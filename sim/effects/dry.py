@@ -14,7 +14,8 @@ import numpy as np
 from sim.effects.effect import Dry, Run, State
 
 REVERSAL = 1e-3  # rad/s, velocity over which a regularised sign turns
-LINK_SHARE = 0.5  # of a link's inertia at the start that is counted on: it changes with the posture
+MOTOR_SHARE = 0.75  # of the inertia that is counted on: with all of it a motor thrown into rest would ring from step to step
+LINK_SHARE = 0.5  # the same of a link's at the start, which changes with the posture
 TURNS, TURNED = 20, 1e-6  # steps of Newton at most; step in multiples of ``REVERSAL`` that ends them
 
 
@@ -49,10 +50,11 @@ def resistance(run: Run, laws: Sequence[Callable[[State], Dry]]) -> Callable[[St
         out = []
         for key, dry in total.items():
             j = dry.joint
-            v, inertia = (x.v_link[:, j], LINK_SHARE * run.link_inertia[:, j]) if dry.link else (x.v[:, j], run.motor_inertia[:, j])
+            v, inertia = (x.v_link, LINK_SHARE * run.link_inertia) if dry.link else (x.v, MOTOR_SHARE * run.motor_inertia)
+            v, inertia = v[:, j], inertia[:, j]
             change = 0.5 * run.step / (inertia * REVERSAL)  # of the velocity half a step on, per torque
             asked = v / REVERSAL - change * before.get(key, 0.0)
-            size = np.where(asked > 0.0, dry.forward, dry.backward)
+            size = np.maximum(np.where(asked > 0.0, dry.forward, dry.backward), 0.0)
             before[key] = -size * np.tanh(turn(asked, change * size))
             out.append((dry, before[key]))
         return out

@@ -26,7 +26,8 @@ from robot_assets.robot import Robot
 class Run:
     """A run: number of simulations S, integration step h (s), sample time (s), compiled model, start times (S,).
 
-    ``motor_inertia``, ``link_inertia`` (S, n): what a torque at these coordinates moves at the start, gears as springs, kg m2.
+    ``motor_inertia``, ``link_inertia`` (S, n): what a torque at these coordinates moves at the start, gears as springs, kg m2;
+    ones where no effect has dry friction.
     """
 
     simulations: int
