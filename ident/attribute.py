@@ -431,13 +431,22 @@ def attribute_once(
     ranked = sorted(best.values(), key=lambda x: x[1].cost)
     if ranked:
         before, ranked = under_noise_of_best(problem, before, ranked, workers)
+    if leaves_much(problem, before, ranked) and not told and not workers.late:
+        before, ranked = beside_strong(problem, before, ranked, scores, workers, quiet)
+    return weighed_round(before, ranked, scores, softly)
+
+
+def leaves_much(problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]) -> bool:
+    """Whether the best candidate leaves so much that a strong effect may be missing.
+
+    That is anything above the noise where the drives cannot be those of the arm, or where the arm may have several steady
+    motions under the law of the best; else more than what is faint, and than errors of its law.
+    """
     bent = bool(ranked) and ranked[0][0].options.get("bends", False)
     spoilt = not problem.motions_alone and (bent or implausible(problem, before))
     excess = before.cost - before.count
     allowed = (DETECTION_EXCESS - 1.0) * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * excess)
-    if min(before.cost - before.count, left_by(ranked)) > allowed and not told and not workers.late:
-        before, ranked = beside_strong(problem, before, ranked, scores, workers, quiet)
-    return weighed_round(before, ranked, scores, softly)
+    return min(excess, left_by(ranked)) > allowed
 
 
 def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozenset[int]:

@@ -11,6 +11,7 @@ from ident.attribute import (
     Attribution,
     Round,
     companions,
+    leaves_much,
     left_share,
     outdone,
     pruned,
@@ -405,6 +406,18 @@ def test_no_strong_effect_is_sought_where_a_cause_has_left_next_to_nothing(ident
     assert fall > 100 * result.counts[j]
     assert [shadows(problem, x, [found]) for x in left] == [{j}, frozenset()]
     assert shadows(problem, left[0], []) == frozenset()
+
+
+@pytest.mark.parametrize(
+    "effect, left, much",
+    [("coulomb_friction", 0.005, False), ("coulomb_friction", 0.02, True), ("backlash", 0.005, True), ("backlash", 0.0, False)],
+)
+def test_errors_of_a_law_ask_for_no_strong_effect(identified, named, effect, left, much):
+    """Unless the law is one under which the arm may have several steady motions: another of them may be the right one."""
+    _, setup, result = identified
+    excess = 1e4 * result.counts
+    before, after = (replace(result, costs=result.counts + x * excess) for x in (1.0, left))
+    assert leaves_much(setup.problem, before, [(named[effect, "elbow_joint"], after)]) == much
 
 
 def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identified):
