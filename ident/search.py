@@ -53,6 +53,7 @@ NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, ab
 NEAR_BODY = 1.0 / 3.0  # the same of a body's inertia, where one answers best
 MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place: share of the highest resonance tried, damping
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
+SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
 WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: linear steps understate strong effects
 
@@ -407,14 +408,16 @@ def strong_effects(
 ) -> list[Score]:
     """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
 
-    None at joints that are ``quiet``.
+    None at joints that are ``quiet``: where most of it is at one of these, the next joint takes its place if it has ``SPILT`` of that.
 
     A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
     of the time hardly shows its inertia: the linear step of a score says little about either. Motions below the
     resonances hardly show the gears.
     """
     preds = predictions(problem, stage.model, stage.remainders)
-    loudest = max(set(range(len(stage.costs))) - quiet, key=lambda j: stage.costs[j], default=-1)
+    excess = stage.costs - stage.counts
+    loud = set(np.flatnonzero(excess >= SPILT * excess.max()).tolist()) - quiet
+    loudest = max(loud, key=lambda j: stage.costs[j], default=-1)
     scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} - quiet if j >= 0}
     return [
         replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))

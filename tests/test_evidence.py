@@ -430,6 +430,7 @@ def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identi
         return {s.hypothesis.joint for s in strong_effects(problem, stage, scores, likely, frozenset(quiet))}
 
     assert joints(4, set()) == {2, 4} and joints(4, {2}) == {1, 4} and joints(2, {2}) == {1}
+    assert joints(4, {1, 2}) == {4}  # what the others have is what the errors at the quiet joint leave there
     assert joints(4, set(range(6))) == set()
 
 
