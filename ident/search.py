@@ -389,7 +389,7 @@ def beside_strong(
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
     told = workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
-    right = [r for (_, r), (h, _) in zip(along, told, strict=False) if not is_along_record(h)]
+    right = [r for (_, r), (h, _) in zip(along[:FINALISTS], told, strict=True) if not is_along_record(h)]
     strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(problem, h.joint, r, right))]
     if any(is_along_record(h) for h, _ in strong):
         whole = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
@@ -443,9 +443,12 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
     if best.costs[joint] <= DETECTION_EXCESS * best.counts[joint]:
         return True
     left = max(along.costs[joint] - along.counts[joint], 0.0)
-    cost = reweighted(problem, best, along.weights).costs[joint]
-    noise = noise_costs(problem, best.weights, along.weights)[joint]
-    return bool(left >= CLEARLY_BETTER * (cost - noise))
+    return bool(left >= CLEARLY_BETTER * excess_under(problem, joint, best, along.weights))
+
+
+def excess_under(problem: Problem, joint: int, result: Fit, weights: Weights) -> float:
+    """Cost of a fit at a joint under other weights, less what its own noise is in those units."""
+    return float(reweighted(problem, result, weights).costs[joint] - noise_costs(problem, result.weights, weights)[joint])
 
 
 def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]) -> bool:
@@ -459,10 +462,7 @@ def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]
     """
     left = max(along.costs[joint] - along.counts[joint], 0.0)
     others = [r for r in right if r.model.effects[-1].hypothesis.joint == joint]
-    return any(
-        reweighted(problem, r, along.weights).costs[joint] - noise_costs(problem, r.weights, along.weights)[joint] <= left
-        for r in others
-    )
+    return any(excess_under(problem, joint, r, along.weights) <= left for r in others)
 
 
 def under_own_noise(problem: Problem, result: Fit) -> Fit:

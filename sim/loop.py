@@ -76,21 +76,19 @@ def run_loop(
     batch = Batch(plant.model, S, nthread=2)
     x, v, force = batch.bind("qpos"), batch.bind("qvel"), batch.bind("qfrc_applied")
     x[:] = qpos
-    dry_friction = [e for e in plant.effects if hasattr(e, "dry")]
-    inertia = free_inertia(plant, qpos) if dry_friction else np.ones((S, plant.model.nv))
-    run = Run(
-        S, h, 1 / sample_rate, plant.robot, plant.drives, plant.model, start, inertia[:, plant.motor], inertia[:, plant.link]
-    )
+    run = Run(S, h, 1 / sample_rate, plant.robot, plant.drives, plant.model, start)
     torques = [e.torque(run) for e in plant.effects if callable(getattr(e, "torque", None))]
-    resist = resistance(run, [e.dry(run) for e in dry_friction])
+    dry = [e.dry(run) for e in plant.effects if hasattr(e, "dry")]
     deliver = [(run.joint(e.place), e.deliver(run)) for e in plant.effects if hasattr(e, "deliver")]
     measure = [
         (run.joint(e.place), getattr(e, "channel", "q"), getattr(e, "after_noise", False), e.measure(run))
         for e in plant.effects
         if hasattr(e, "measure")
     ]
-    fine = bool(torques or dry_friction or deliver or any(not late for _, _, late, _ in measure))
+    fine = bool(torques or dry or deliver or any(not late for _, _, late, _ in measure))
     m, a = plant.motor, plant.link
+    inertia = free_inertia(plant, qpos) if dry else np.ones((S, plant.model.nv))
+    resist = resistance(h, dry, inertia[:, m], inertia[:, a])
     tau, q, q_link = (np.empty((S, samples, n)) for _ in range(3))
     integral = np.zeros((S, n))
     velocity = np.zeros((S, n))

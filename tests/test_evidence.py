@@ -10,6 +10,7 @@ from ident.attribute import (
     LEFT_TO_DECOYS,
     Attribution,
     Round,
+    attribute,
     companions,
     leaves_much,
     left_share,
@@ -34,6 +35,7 @@ from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums, scre
 from ident.search import (
     PER_EFFECT,
     STRONG,
+    beside_strong,
     choose,
     explore,
     matched,
@@ -432,6 +434,25 @@ def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identi
     assert joints(4, set()) == {2, 4} and joints(4, {2}) == {1, 4} and joints(2, {2}) == {1}
     assert joints(4, {1, 2}) == {4}  # what the others have is what the errors at the quiet joint leave there
     assert joints(4, set(range(6))) == set()
+
+
+def test_a_search_seeks_no_strong_effect_at_quiet_joints(identified, monkeypatch):
+    """From the rounds before to the fits: what is quiet is asked of the model as it is, and left out of what is fitted."""
+    _, setup, result = identified
+    problem, told, given = setup.problem, [], []
+
+    def lost(*args, **kwargs):
+        raise ArithmeticError
+
+    monkeypatch.setattr("ident.search.anneal", lost)
+    scores = screen(problem, result, predictions(problem, result.model, result.remainders), catalogue(problem.structure))
+    for quiet in (range(6), ()):
+        assert beside_strong(problem, result, [], scores, Workers(progress=told.append), frozenset(quiet)) == (result, [])
+        assert bool(told) != bool(quiet)
+    monkeypatch.setattr("ident.attribute.shadows", lambda *args: frozenset({3}))
+    monkeypatch.setattr("ident.attribute.attribute_once", lambda *args: given.append(args[-1]) or Round(result, (), (), 1.0, 0.0))
+    attribute(problem, replace(result, costs=10.0 * result.counts))
+    assert given == [frozenset({3})]
 
 
 def test_where_a_body_answers_best_those_near_it_are_tried_too(named):

@@ -19,8 +19,7 @@ from tests.conftest import small_plan
 
 def run_of(plant):
     """A run of one simulation in steps of 0.1 ms."""
-    inertia = np.ones((1, plant.robot.n))
-    return Run(1, 1e-4, 1e-3, plant.robot, plant.drives, plant.model, np.zeros(1), inertia, inertia)
+    return Run(1, 1e-4, 1e-3, plant.robot, plant.drives, plant.model, np.zeros(1))
 
 
 def test_rest_sags_by_torque_over_stiffness(ur10):
@@ -92,9 +91,9 @@ def test_dry_friction_does_not_depend_on_the_step(ur10, hidden):
 def test_a_motor_thrown_into_friction_comes_to_rest(ur10):
     """Without other torque: the friction of a step is twenty times what turns its sign, and no velocity is left but of the turn."""
     h, start = 1e-4, 0.01
-    run = run_of(build_plant(ur10))
+    inertia = np.ones((1, ur10.n))
     size = 20.0 * REVERSAL * 2.0 / h
-    resist = resistance(run, [lambda x: Dry(0, size, size)])
+    resist = resistance(h, [lambda x: Dry(0, size, size)], inertia, inertia)
     v, old = np.full((1, ur10.n), start), np.full((1, ur10.n), start)
     for _ in range(40):
         mid = 1.5 * v - 0.5 * old

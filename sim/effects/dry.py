@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sim.effects.effect import Dry, Run, State
+from sim.effects.effect import Dry, State
 
 REVERSAL = 1e-3  # rad/s, velocity over which a regularised sign turns
 MOTOR_SHARE = 0.75  # of the inertia that is counted on: with all of it a motor thrown into rest would ring from step to step
@@ -34,14 +34,22 @@ def turn(asked: np.ndarray, size: np.ndarray) -> np.ndarray:
     return x
 
 
-def resistance(run: Run, laws: Sequence[Callable[[State], Dry]]) -> Callable[[State], list[tuple[Dry, np.ndarray]]]:
+def resistance(
+    step: float, laws: Sequence[Callable[[State], Dry]], motor_inertia: np.ndarray, link_inertia: np.ndarray
+) -> Callable[[State], list[tuple[Dry, np.ndarray]]]:
     """Torque (S,) against the motion of each joint that has dry friction, all of its laws together, N m.
 
     What else acts on the coordinate is taken from the step before: of its change of velocity, all but the friction.
+
+    Args:
+        step: of the integration, s.
+        motor_inertia, link_inertia: (S, n) what a torque there moves at the start, gears as springs, kg m2.
     """
+    # Of the velocity half a step on, per torque.
+    change_of = {link: 0.5 * step / (REVERSAL * x) for link, x in ((False, MOTOR_SHARE * motor_inertia), (True, LINK_SHARE * link_inertia))}
     before: dict[tuple[int, bool], np.ndarray] = {}
 
-    def step(x: State) -> list[tuple[Dry, np.ndarray]]:
+    def against(x: State) -> list[tuple[Dry, np.ndarray]]:
         total: dict[tuple[int, bool], Dry] = {}
         for law in laws:
             new = law(x)
@@ -50,13 +58,11 @@ def resistance(run: Run, laws: Sequence[Callable[[State], Dry]]) -> Callable[[St
         out = []
         for key, dry in total.items():
             j = dry.joint
-            v, inertia = (x.v_link, LINK_SHARE * run.link_inertia) if dry.link else (x.v, MOTOR_SHARE * run.motor_inertia)
-            v, inertia = v[:, j], inertia[:, j]
-            change = 0.5 * run.step / (inertia * REVERSAL)  # of the velocity half a step on, per torque
+            v, change = (x.v_link if dry.link else x.v)[:, j], change_of[dry.link][:, j]
             asked = v / REVERSAL - change * before.get(key, 0.0)
             size = np.maximum(np.where(asked > 0.0, dry.forward, dry.backward), 0.0)
             before[key] = -size * np.tanh(turn(asked, change * size))
             out.append((dry, before[key]))
         return out
 
-    return step
+    return against

@@ -24,11 +24,7 @@ from robot_assets.robot import Robot
 
 @dataclass(frozen=True)
 class Run:
-    """A run: number of simulations S, integration step h (s), sample time (s), compiled model, start times (S,).
-
-    ``motor_inertia``, ``link_inertia`` (S, n): what a torque at these coordinates moves at the start, gears as springs, kg m2;
-    ones where no effect has dry friction.
-    """
+    """A run: number of simulations S, integration step h (s), sample time (s), compiled model, start times (S,)."""
 
     simulations: int
     step: float
@@ -37,8 +33,6 @@ class Run:
     drives: dict[str, np.ndarray]
     model: mujoco.MjModel
     start: np.ndarray
-    motor_inertia: np.ndarray
-    link_inertia: np.ndarray
 
     def joint(self, name: str) -> int:
         return self.robot.joint_names.index(name)
