@@ -8,18 +8,22 @@ nominal; the plant's step and integrator differ from case to case.
 Cases run side by side in processes, or on a Dask cluster (``--executor dask://HOST:PORT``) whose workers
 have this folder on their path.
 
-``--kind mix`` draws the arm as well, and none, one, two or an effect that the catalogue lacks.
+``--kind mix`` draws the arm as well, and none, one, two or an effect that the catalogue lacks. ``--sizes 3 100`` scales
+every effect until what it changes alone is that many times the noise, spread evenly over its logarithm.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import tempfile
 import time
 import traceback
+from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +31,14 @@ import scipy.fft
 from blind_summary import pictures, table
 from outside import draw_outside
 from provenance import commit
+from sizing import brought_to
 
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
 from ident.excitation import Plan, operating_points
 from ident.parallel import open_executor
-from robot_assets.robot import load_robot
+from robot_assets.robot import Robot, load_robot
 from sim import draw_effect, run_experiment
 from sim.effects import EFFECTS, parameters_of
 from sim.experiment import draw_drives, plan_experiment
@@ -43,15 +48,19 @@ ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "
 ARMS = ("ur10", "irb", "panda")
 KINDS = {"none": 0.15, "one": 0.5, "two": 0.2, "outside": 0.15}
 COUNTS = {"none": 0, "one": 1, "two": 2, "outside": 0}
-SIZES = {"smoke": 6, "quick": 26, "sixty": 60, "full": 400}
+CASES = {"smoke": 6, "quick": 26, "sixty": 60, "full": 400}
 
 
 @dataclass(frozen=True)
 class Case:
-    """A plan, what is hidden in the plant, and the plant's own figures."""
+    """A plan, what is hidden in the plant, and the plant's own figures.
+
+    ``stronger`` gives each hidden effect again, its strength times a factor.
+    """
 
     plan: Plan
     hidden: list
+    stronger: list[Callable[[float], object]]
     drives: dict[str, np.ndarray]
     timestep: float
     seed: int
@@ -59,14 +68,13 @@ class Case:
     def simulate(self) -> Dataset:
         return run_experiment(self.plan, self.hidden, seed=self.seed, drives=self.drives, timestep=self.timestep)
 
-    def truth(self) -> list[dict]:
+    def truth(self, size: Callable[[object], float]) -> list[dict]:
         return [
-            {"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e)), "size": size}
-            for e, size in zip(self.hidden, self.sizes(), strict=True)
+            {"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e)), "size": size(e)} for e in self.hidden
         ]
 
-    def sizes(self) -> list[float]:
-        """Distortion over noise of each effect: what it alone changes at the joint that shows it most.
+    def sizer(self) -> Callable[[object], float]:
+        """Distortion over noise of an effect: what it alone changes at the joint that shows it most.
 
         Root mean square over the excited band of the change of torque and position lines, over the noise of
         these lines, at the first posture and the largest level; the plant is simulated without noise.
@@ -83,17 +91,24 @@ class Case:
                 small, effects, seed=self.seed, drives=self.drives, timestep=self.timestep, noise=0.0
             ).segments
 
-        def size(changed: tuple[Segment, ...]) -> float:
+        plain = quiet([])
+
+        def size(effect: object) -> float:
             power = np.zeros(robot.n)
-            for a, b in zip(plain, changed, strict=True):
+            for a, b in zip(plain, quiet([effect]), strict=True):
                 for channel, std in (("tau", robot.array("tau_std")), ("q", robot.array("q_std"))):
                     change = scipy.fft.rfft((b.periodic(channel) - a.periodic(channel)).mean(axis=0), axis=0, norm="forward")
                     noise = std**2 / (a.period * a.steady_periods)
                     power += np.mean(np.abs(change[:lines]) ** 2, axis=0) / noise / (2 * len(some))
             return float(np.sqrt(power.max()))
 
-        plain = quiet([]) if self.hidden else ()
-        return [size(quiet([effect])) for effect in self.hidden]
+        return size
+
+    def scaled(self, size: Callable[[object], float], low: float, high: float) -> Case:
+        """The case with each effect at a size drawn between two, as near as its strength brings it there."""
+        rng = np.random.default_rng([self.seed, 2])
+        targets = np.exp(rng.uniform(np.log(low), np.log(high), len(self.hidden)))
+        return replace(self, hidden=[brought_to(s, size, t) for s, t in zip(self.stronger, targets, strict=True)])
 
 
 def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: str) -> Case:
@@ -122,23 +137,46 @@ def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: s
     )
     peak = np.max([np.abs(e.r).max(axis=0) for e in plan.experiments], axis=0)
     peak = peak + np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0)
-    hidden = []
+    draws: list[tuple[Callable, tuple[float, float]]] = []
     if kind == "outside":
-        hidden.append(draw_outside(rng, robot, float(np.exp(rng.uniform(-0.5, 1.0)))))
+        draws.append((lambda rng, strength: draw_outside(rng, robot, strength), (-0.5, 1.0)))
     for i in range(COUNTS[kind]):
         name = pool[(seed + i * 7) % len(pool)]
-        strength = float(np.exp(rng.uniform(-0.5, 0.7)))
-        hidden.append(draw_effect(rng, robot, names=(name,), strength=strength, peak_torque=peak))
-    return Case(plan, hidden, draw_drives(rng, robot), float(rng.choice([2.5e-4, 2e-4])), seed)
+        draws.append((partial(_drawn, robot=robot, name=name, peak_torque=peak), (-0.5, 0.7)))
+    hidden, stronger = [], []
+    for draw, spread in draws:
+        strength = float(np.exp(rng.uniform(*spread)))
+        same = copy.deepcopy(rng)
+        hidden.append(draw(rng, strength))
+        stronger.append(partial(_again, draw, same, strength))
+    return Case(plan, hidden, stronger, draw_drives(rng, robot), float(rng.choice([2.5e-4, 2e-4])), seed)
 
 
-def run_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: str) -> dict:
-    """Draw, simulate, write, read, diagnose, compare."""
+def _drawn(rng: np.random.Generator, strength: float, *, robot: Robot, name: str, peak_torque: np.ndarray) -> object:
+    return draw_effect(rng, robot, names=(name,), strength=strength, peak_torque=peak_torque)
+
+
+def _again(draw: Callable, rng: np.random.Generator, strength: float, factor: float) -> object:
+    return draw(copy.deepcopy(rng), strength * factor)
+
+
+def run_case(
+    seed: int, names: tuple[str, ...] | None, kind: str, robot_name: str, sizes: tuple[float, float] | None = None
+) -> dict:
+    """Draw, simulate, write, read, diagnose, compare.
+
+    Args:
+        sizes: distortion over noise between which each effect is scaled; as drawn where None.
+    """
     case = draw_case(seed, names, kind, robot_name)
     truth = [{"effect": e.name, "place": e.place} for e in case.hidden]
     began = time.perf_counter()
     try:
-        truth, data = case.truth(), case.simulate()
+        if case.hidden:
+            size = case.sizer()
+            case = case if sizes is None else case.scaled(size, *sizes)
+            truth = case.truth(size)
+        data = case.simulate()
     except Exception as err:
         return {"seed": seed, "truth": truth, "error": f"{type(err).__name__}: {err}"}
     simulated = time.perf_counter() - began
@@ -218,17 +256,19 @@ def line(row: dict) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--size", choices=SIZES, default="quick")
+    parser.add_argument("--size", choices=CASES, default="quick")
     parser.add_argument("--effects", default="", help="comma-separated; all where empty; 'six' for the first six")
     parser.add_argument("--kind", choices=(*KINDS, "mix"), default="one", help="what is hidden")
     parser.add_argument("--robot", default="ur10", help="folder or name of an arm; 'mix' draws one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--executor", default="processes", help="processes, processes:N or dask://HOST:PORT")
+    parser.add_argument("--sizes", type=float, nargs=2, metavar=("LOW", "HIGH"), help="distortion over noise of every effect")
     parser.add_argument("--cases", type=int, help="number of cases, instead of a size")
     parser.add_argument("--out", type=Path, help="stem of the results: .json, .txt and .png")
     args = parser.parse_args()
     names = ISSUE_SIX if args.effects == "six" else tuple(filter(None, args.effects.split(","))) or None
-    cases = [(args.seed + i, names, args.kind, args.robot) for i in range(args.cases or SIZES[args.size])]
+    sizes = tuple(args.sizes) if args.sizes else None
+    cases = [(args.seed + i, names, args.kind, args.robot, sizes) for i in range(args.cases or CASES[args.size])]
     with open_executor(args.executor) as executor:
         rows = run(cases, executor or ThreadPoolExecutor(1))
     text = table(rows)
@@ -239,6 +279,8 @@ def main() -> None:
         options = f"--kind {args.kind} --robot {args.robot} --seed {args.seed} --cases {len(rows)}"
         if args.effects:
             options += f" --effects {args.effects}"
+        if args.sizes:
+            options += f" --sizes {args.sizes[0]:g} {args.sizes[1]:g}"
         head = f"python benchmarks/blind.py {options}, commit {commit()}"
         lines = "\n".join(line(row) for row in rows)
         args.out.with_suffix(".txt").write_text(f"{head}\n{lines}\n{text}\n", encoding="utf-8")
