@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
+from ident.baseline import DETECTION_EXCESS
 from ident.extended import Effect
 from ident.hypotheses import Hypothesis, Parameter
 from ident.torque_fit import Fit, inverse
@@ -17,6 +18,7 @@ ABSENT_LEVEL = 2.7e-3  # the same of several together, as a probability
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
 MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
 STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
+LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave
 POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found absent
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 WAVE = "sine", "cosine"  # amplitudes of an effect that repeats along its variable
@@ -33,13 +35,13 @@ class Candidate:
     probability: float = 0.0
 
 
-def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
+def explained(before: Fit, after: Fit, noise: float = DETECTION_EXCESS) -> float:
     """Share of the excess over noise that a cause explains: of all of it, or at the joint where it explains most.
 
     Of several causes at different joints each explains a part of the whole and most of its own joint.
 
     Args:
-        noise: of what is compared, in units of the weights: next to nothing where these bear with large errors.
+        noise: of what is compared, in units of the weights, at most: next to nothing where these bear with large errors.
     """
     falls = before.costs - after.costs
     joint = int(np.argmax(falls))
@@ -61,10 +63,26 @@ def rivals_of_best(
     falls = before.costs - top.costs
     at = int(np.argmax(falls))
     if best.channel == "model" or best.joint < 0 or falls[at] <= 0.0:
-        return ranked, max(top.cost - before.count, 0.0)
+        return ranked, model_error(top.cost, before.count, float(np.sum(falls)))
     kept = [(h, r) for h, r in ranked if before.costs[at] - r.costs[at] >= RIVAL * falls[at]]
-    left = min(r.costs[at] for _, r in kept) - before.counts[at]
-    return kept, max(float(left), 0.0)
+    left = min(r.costs[at] for _, r in kept)
+    return kept, model_error(float(left), float(before.counts[at]), float(falls[at]))
+
+
+def model_error(left: float, count: float, fall: float) -> float:
+    """Excess of a cost over noise that may be an error of the law of what it is left by.
+
+    What lies within the error of the estimate of the noise is that only as far as it is a ``LAW_ERROR`` of what the law
+    explains, and no law leaves more than it explains.
+
+    Args:
+        left: cost that the best candidate leaves, of ``count`` data.
+        fall: of the cost, by the best candidate.
+    """
+    within = np.clip(left - count, 0.0, (DETECTION_EXCESS - 1.0) * count)
+    above = max(left - DETECTION_EXCESS * count, 0.0)
+    fall = max(fall, 0.0)
+    return float(min(within, LAW_ERROR * fall) + min(above, fall))
 
 
 def weigh(candidates: Sequence[Candidate], excess: float) -> list[Candidate]:

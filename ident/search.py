@@ -258,7 +258,8 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
     """Candidates that a few steps have not shown to be far behind the best.
 
     The one that screening puts first is kept: where the drives have taken its place, as a stiffer gear takes that of
-    one that yields late, the first steps lead uphill.
+    one that yields late, the first steps lead uphill. So is the special case of a law that is kept, which does less by what the
+    law has beyond it: where that is noise, it is the special case that is right.
 
     Args:
         found: in the order of their scores.
@@ -269,7 +270,9 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
         (h, r) for i, (h, r) in enumerate(ranked[:HOPEFUL]) if i < FINALISTS or (r.cost - r.count < limit and not r.converged)
     ]
     first = [(h, r) for h, r in found[:1] if not r.converged and all(h is not k for k, _ in kept)]
-    return [*kept, *first]
+    kept += first
+    special = {(h.options.get("absorbs"), h.place) for h, _ in kept}
+    return [*kept, *((h, r) for h, r in ranked if h.key in special and all(h is not k for k, _ in kept))]
 
 
 def refit(

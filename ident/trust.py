@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident.attribute import UNTOLD, Attribution, Round
+from ident.attribute import SHADOW, UNTOLD, Attribution, Round, on_chain
 from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
 from ident.hypotheses import Hypothesis
@@ -25,14 +25,13 @@ SAME_PERIOD = 0.01  # relative, of two ripples
 FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band for its name to be trusted
 SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
 HARMONIC = 0.1  # the same of a ripple at a multiple of the periods of another one
-SHADOW = 1e-3  # the same of any other cause at the joint: errors of a law of a few per cent
 HALF_TRUSTED = 0.1  # share of the discrepancy left, a third of its amplitude, at which a name is as likely wrong as right
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 
 def _at(h: Hypothesis, costs: np.ndarray) -> float:
     """Of costs by joint, those that an effect answers for: its joint, or all where it changes the chain."""
-    return float(costs[h.joint] if h.joint >= 0 and h.channel != "model" else np.sum(costs))
+    return float(np.sum(costs) if on_chain(h) else costs[h.joint])
 
 
 def _excess(result: Fit, level: float) -> np.ndarray:
@@ -113,7 +112,7 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
         return float(x.before.costs[h.joint] - x.candidates[0].fit.costs[h.joint])
 
     h = found.candidates[0].hypothesis
-    if h.joint < 0 or h.channel == "model":
+    if on_chain(h):
         return False
     for other in rounds:
         o = other.candidates[0].hypothesis

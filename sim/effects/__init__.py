@@ -167,7 +167,8 @@ def draw_effect(
     name = str(rng.choice(list(names or EFFECTS)))
     place = place or str(rng.choice(valid_places(name, robot)))
     joint = robot.joints[robot.joint_names.index(place)] if place in robot.joint_names else robot.joints[0]
-    size = strength * float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
+    spread = float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
+    size = strength * spread
     peak = 0.5 * joint.torque_limit
     if peak_torque is not None and place in robot.joint_names:
         peak = float(peak_torque[robot.joint_names.index(place)])
@@ -190,7 +191,7 @@ def draw_effect(
         "stribeck_friction": {"coulomb": torque, "static": 2 * torque, "stribeck_velocity": 0.03},
         "presliding_friction": {"stiffness": torque / 2e-3, "coulomb": torque},
         "load_dependent_friction": {"coefficient": 0.05 * size},
-        "friction_drift": {"relative_change": -min(0.3 * size, 0.8), "time_constant": 60.0, "coulomb": torque},
+        "friction_drift": {"relative_change": -min(0.3 * spread, 0.8), "time_constant": 60.0, "coulomb": torque},
         "cogging": {"amplitude": 0.5 * torque, "periods_per_rev": periods, "phase": phase},
         "torque_constant": {"scale": 1 + 0.08 * size * float(rng.choice([-1, 1]))},
         "torque_lag": {"time_constant": 1e-3 * size},
