@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from provenance import commit
 
-from ident.attribute import DETECTION_LEVEL
-from ident.baseline import DETECTION_EXCESS, UNDETERMINED, discrepancy_p_value
+from ident.attribute import attribute
+from ident.baseline import UNDETERMINED
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import identify
 from ident.excitation import operating_points
@@ -57,11 +57,11 @@ def run_draw(seed: int) -> Draw:
     drives = draw_drives(rng, robot)
     with tempfile.TemporaryDirectory() as folder:
         save_dataset(run_experiment(plan, seed=seed, drives=drives), Path(folder) / "d")
-        _, result = identify(load_dataset(Path(folder) / "d"))
+        setup, result = identify(load_dataset(Path(folder) / "d"))
     truth = np.concatenate([drives[k] for k in KINDS])
     error = np.exp(result.model.par.to_log()) / truth - 1.0
     std = np.sqrt(np.diag(result.covariance()))[: len(truth)]
-    seen = discrepancy_p_value(result) < DETECTION_LEVEL and result.chi2_per_dof > DETECTION_EXCESS
+    seen = attribute(setup.problem, result).detected
     return Draw(seed, error, std, result.chi2_per_dof, seen)
 
 

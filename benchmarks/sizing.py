@@ -11,6 +11,7 @@ E = TypeVar("E")
 
 TRIALS = 6  # sizes found out, at most
 NEAR = 0.1  # logarithm of the ratio to the target within which an effect is there
+LONGEST = 4.0  # step of log strength
 SLOPES = 0.3, 3.0  # of log size over log strength that a step believes
 
 
@@ -33,5 +34,5 @@ def brought_to(stronger: Callable[[float], E], size: Callable[[E], float], targe
         if len(found) > 1:
             (a, u, _), (b, v, _) = found[-2:]
             slope = float(np.clip((v - u) / (b - a), *SLOPES))
-        step -= off / slope
+        step -= float(np.clip(off / slope, -LONGEST, LONGEST))
     return min(found, key=lambda x: abs(x[1]))[2]

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import scipy.stats
 
 from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, implausible
 from ident.evidence import (
@@ -30,6 +29,7 @@ from ident.evidence import (
     weigh,
 )
 from ident.extended import Effect, is_along_record
+from ident.faint import SEEN, chance, faint_scores, seen
 from ident.hypotheses import Hypothesis, catalogue
 from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
@@ -59,12 +59,10 @@ from ident.torque_fit import Fit, Problem, predictions
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DOUBTED_LEVEL = 1e-2  # the same where the drives that fit cannot be those of this arm
 RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the record leaves no more than noise
-SEEN = 50.0  # fall of the scaled cost in a linear step from which a cause is sought in what is no more than noise as a whole
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record, from which its loop is begun
-SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
@@ -127,24 +125,27 @@ def attribute(
     hypotheses = tuple(hypotheses)
     p_value = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
-    detected = p_value < level and baseline.chi2_per_dof > DETECTION_EXCESS
-    if not detected and max_causes:
-        best = clearest(problem, baseline, hypotheses)
-        detected = seen(best, baseline)
-        p_value = min(p_value, chance_of(best, hypotheses)) if detected else p_value
+    loud = p_value < level and baseline.chi2_per_dof > DETECTION_EXCESS
     current, rounds, unknown, count = baseline, [], False, 0
-    while detected and count < max_causes and not workers.late:
-        faint = settled(current)
-        if faint and rounds and not seen(clearest(problem, current, hypotheses, baseline.costs - current.costs), current):
-            break
-        workers.say(f"cause {count + 1}: screening {len(hypotheses)} hypotheses")
+    while count < max_causes and not workers.late:
+        asked, faint = hypotheses, not loud or settled(current)
+        if faint:
+            workers.say("what the noise as a whole would hide")
+            scores = faint_scores(problem, current, hypotheses, baseline.costs - current.costs)
+            clear = seen(scores, current)
+            if clear is None:
+                break
+            asked = tuple(s.hypothesis for s in scores)
+            p_value = p_value if loud or rounds else chance(clear, scores)
+        workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
         # What is left beside a cause is mostly what its law lacks, and no hinge; what is faint shows none everywhere.
         bare = np.inf if rounds or faint else worth_a_hinge(current)
-        quiet = shadows(problem, current, rounds)
-        found = attribute_once(problem, current, hypotheses, workers, worth_a_refit(current), bare, quiet)
+        least = 0.0 if faint else worth_a_refit(current)
+        quiet = frozenset() if faint else shadows(problem, current, rounds)
+        found = attribute_once(problem, current, asked, workers, least, bare, quiet)
         if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
-            found = beside_unclear(problem, current, found, hypotheses, workers, bare)
-        if not answers(found):
+            found = beside_unclear(problem, current, found, asked, workers, bare)
+        if not answers(found, SEEN if faint else MIN_EVIDENCE):
             break
         found = with_name(found)
         best = found.candidates[0]
@@ -171,51 +172,24 @@ def attribute(
     current, rounds = rematched(problem, current, rounds, workers)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
-    return Attribution(baseline, detected, p_value, kept, current, unknown or any(outdone(r) for r in kept))
+    unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
+    if not loud and not kept:
+        p_value = discrepancy_p_value(baseline)
+    return Attribution(baseline, loud or bool(kept), p_value, kept, current, unknown)
 
 
-def clearest(
-    problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray | None = None
-) -> Score | None:
-    """The hypothesis of which a linear step explains most, as far as that is no shadow of causes found; None where there is none.
-
-    Nor is there one beside a law along the record, which turns noise into a signal of its own.
-
-    Args:
-        told: (n,) fall of the cost by joint that causes have brought.
-    """
-    if any(is_along_record(e.hypothesis) for e in current.model.effects):
-        return None
-    scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
-    least = np.zeros(len(current.costs)) if told is None else SHADOW * told
-    return next((s for s in scores if on_chain(s.hypothesis) or s.gain > least[s.hypothesis.joint]), None)
+def told_share(baseline: Fit, found: Round) -> float:
+    """Share of the discrepancy of the baseline that a round explains; more than 1 of one within the error of the noise."""
+    fall = found.before.cost - found.candidates[0].fit.cost
+    return fall / max(baseline.cost - DETECTION_EXCESS * baseline.count, 1.0)
 
 
-def on_chain(h: Hypothesis) -> bool:
-    """Whether a hypothesis changes the chain, and shows at every joint."""
-    return h.joint < 0 or h.channel == "model"
-
-
-def seen(best: Score | None, current: Fit) -> bool:
-    """Whether a linear step explains more than the noise has by chance, however little of the whole noise that is.
-
-    A sum of squares over all lines of all joints shows a cause only where it raises that sum by more than the error of the
-    estimate of the noise; its own response, a few numbers, is known to far less (score test, theory.md 9.3).
-    """
-    return best is not None and best.gain > SEEN * max(1.0, current.chi2_per_dof)
-
-
-def chance_of(best: Score, hypotheses: Sequence[Hypothesis]) -> float:
-    """Probability that the best of all hypotheses explains so much of noise alone, at most (Bonferroni)."""
-    return float(min(1.0, len(hypotheses) * scipy.stats.chi2.sf(best.gain, best.dof)))
-
-
-def answers(found: Round) -> bool:
-    """Whether the best candidate of a round explains enough to be a cause."""
+def answers(found: Round, least: float = MIN_EVIDENCE) -> bool:
+    """Whether the best candidate of a round explains enough to be a cause, ``least`` of the scaled cost."""
     if not found.candidates:
         return False
     fall = (found.before.cost - found.candidates[0].fit.cost) / found.scale
-    return fall >= MIN_EVIDENCE and found.explained >= MIN_SHARE
+    return fall >= least and found.explained >= MIN_SHARE
 
 
 def with_name(found: Round) -> Round:
@@ -561,5 +535,6 @@ def weighed_round(
     rivals, excess = rivals_of_best(before, ranked)
     weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
-    share = max(explained(before, weighed[0].fit), softly.get(weighed[0].hypothesis.key, 0.0))
-    return Round(before, tuple(weighed), tuple(scores), scale, share)
+    noise = DETECTION_EXCESS if before.chi2_per_dof <= DETECTION_EXCESS else 1.0
+    share = max(explained(before, weighed[0].fit, noise), softly.get(weighed[0].hypothesis.key, 0.0))
+    return Round(before, tuple(weighed), tuple(scores), scale, min(share, 1.0))

@@ -12,7 +12,7 @@ from ident.extended import Effect, Model
 from ident.graybox import Parameters
 from ident.torque_fit import ANNEALING, Fit, Problem, anneal
 
-DETECTION_EXCESS = 1.10  # chi2 per degree of freedom below which it is not worth a name
+DETECTION_EXCESS = 1.10  # chi2 per degree of freedom up to which the estimate of the noise may be short of it
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive among the parameters
 ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again

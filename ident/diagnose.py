@@ -385,7 +385,7 @@ def by_link_encoders(
 
 def explained(result: Attribution) -> bool:
     """Whether causes found in torque and link encoders explain what both show."""
-    return result.detected and not result.unknown and result.left_share <= LEFT_BY_BOTH
+    return bool(result.rounds) and result.detected and not result.unknown and result.left_share <= LEFT_BY_BOTH
 
 
 def with_inertias(

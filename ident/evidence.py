@@ -35,13 +35,14 @@ class Candidate:
     probability: float = 0.0
 
 
-def explained(before: Fit, after: Fit, noise: float = DETECTION_EXCESS) -> float:
+def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
     """Share of the excess over noise that a cause explains: of all of it, or at the joint where it explains most.
 
     Of several causes at different joints each explains a part of the whole and most of its own joint.
 
     Args:
-        noise: of what is compared, in units of the weights, at most: next to nothing where these bear with large errors.
+        noise: of what is compared, in units of the weights: next to nothing where these bear with large errors, and at most what
+            its estimate may be short of where no more is left.
     """
     falls = before.costs - after.costs
     joint = int(np.argmax(falls))
@@ -70,19 +71,18 @@ def rivals_of_best(
 
 
 def model_error(left: float, count: float, fall: float) -> float:
-    """Excess of a cost over noise that may be an error of the law of what it is left by.
+    """Excess of a cost over noise that counts as an error of the law that leaves it.
 
-    What lies within the error of the estimate of the noise is that only as far as it is a ``LAW_ERROR`` of what the law
-    explains, and no law leaves more than it explains.
+    What lies within the error of the estimate of the noise counts as far as it is a ``LAW_ERROR`` of what the law explains;
+    all of it where that is not known.
 
     Args:
         left: cost that the best candidate leaves, of ``count`` data.
-        fall: of the cost, by the best candidate.
+        fall: of the cost, by the best candidate; not known where it is not above nothing.
     """
-    within = np.clip(left - count, 0.0, (DETECTION_EXCESS - 1.0) * count)
+    within = float(np.clip(left - count, 0.0, (DETECTION_EXCESS - 1.0) * count))
     above = max(left - DETECTION_EXCESS * count, 0.0)
-    fall = max(fall, 0.0)
-    return float(min(within, LAW_ERROR * fall) + min(above, fall))
+    return above + (min(within, LAW_ERROR * fall) if fall > 0.0 else within)
 
 
 def weigh(candidates: Sequence[Candidate], excess: float) -> list[Candidate]:

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ident.attribute import SHADOW, UNTOLD, Attribution, Round, on_chain
+from ident.attribute import UNTOLD, Attribution, Round
 from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
+from ident.faint import SHADOW, on_chain
 from ident.hypotheses import Hypothesis
 from ident.torque_fit import Fit, Problem
 from ident.verdict import Gain

@@ -1,0 +1,60 @@
+"""Causes that raise the noise as a whole by less than its estimate errs.
+
+The sum of squares over all lines of all joints shows a cause only where it raises that sum by more than the error of the
+estimate of the noise. The response of one hypothesis is a few numbers, and known to far less: nothing but noise explains
+about 20 of the cost in the best of all hypotheses, on any arm, and a tenth more noise at each of many thousand lines
+no more than a tenth more of that (score test, Rao 1948; theory.md 9.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.stats
+
+from ident.extended import is_along_record
+from ident.hypotheses import Hypothesis
+from ident.screening import Score, screen
+from ident.torque_fit import Fit, Problem, predictions
+
+SEEN = 50.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
+SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
+
+
+def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray) -> list[Score]:
+    """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
+
+    None where the noise is not measured by the scatter between periods, beside link encoders, of which the weights follow
+    what the model leaves, and beside a law along the record, which turns noise into a signal of its own.
+
+    Args:
+        told: (n,) fall of the cost by joint that causes have brought.
+    """
+    measured = all(g.window is None and g.U_periods.shape[1] > 1 and not g.links for g in problem.groups)
+    if not measured or any(is_along_record(e.hypothesis) for e in current.model.effects):
+        return []
+    at_joints = SHADOW * np.maximum(told, 0.0)
+    scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
+    return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]
+
+
+def seen(scores: Sequence[Score], current: Fit) -> Score | None:
+    """The clearest score, if noise does not come near it by chance, nor noise that was estimated too small at its joint."""
+    whole = max(1.0, current.chi2_per_dof)
+    by_joint = np.maximum(current.costs / np.maximum(current.counts, 1.0), whole)
+    return next((s for s in scores if s.gain > SEEN * _at(s.hypothesis, by_joint, whole)), None)
+
+
+def chance(best: Score, scores: Sequence[Score]) -> float:
+    """About the probability that the best of all hypotheses explains so much of noise alone (Bonferroni, a trial each)."""
+    return float(min(1.0, len(scores) * scipy.stats.chi2.sf(best.gain, best.dof)))
+
+
+def on_chain(h: Hypothesis) -> bool:
+    """Whether a hypothesis changes the chain, and shows at every joint."""
+    return h.joint < 0 or h.channel == "model"
+
+
+def _at(h: Hypothesis, by_joint: np.ndarray, whole: float) -> float:
+    return float(whole if on_chain(h) else by_joint[h.joint])
