@@ -29,7 +29,7 @@ from ident.evidence import (
     weigh,
 )
 from ident.extended import Effect, is_along_record
-from ident.faint import SEEN, chance, faint_scores, seen
+from ident.faint import LINEAR, SEEN, chance, faint_scores, seen
 from ident.hypotheses import Hypothesis, catalogue
 from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
@@ -126,8 +126,11 @@ def attribute(
     p_value = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
     loud = p_value < level and baseline.chi2_per_dof > DETECTION_EXCESS
-    current, rounds, unknown, count = baseline, [], False, 0
+    current, rounds, unknown, count, looped = baseline, [], False, 0, None
     while count < max_causes and not workers.late:
+        if settled(current) and looped is not current:
+            # Along the record noise is taken large, and hides other causes.
+            current = looped = as_loops(problem, current, workers)
         asked, faint = hypotheses, not loud or settled(current)
         if faint:
             workers.say("what the noise as a whole would hide")
@@ -135,7 +138,7 @@ def attribute(
             clear = seen(scores, current)
             if clear is None:
                 break
-            asked = tuple(s.hypothesis for s in scores)
+            asked = tuple(s.hypothesis for s in scores if s.gain >= LINEAR * clear.gain)
             p_value = p_value if loud or rounds else chance(clear, scores)
         workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
         # What is left beside a cause is mostly what its law lacks, and no hinge; what is faint shows none everywhere.
@@ -167,7 +170,7 @@ def attribute(
         taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in current.model.effects}
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
-    if not workers.late:
+    if looped is not current and not workers.late:
         current = as_loops(problem, current, workers)
     current, rounds = rematched(problem, current, rounds, workers)
     left = {e.hypothesis.key for e in current.model.effects}

@@ -19,21 +19,25 @@ from ident.screening import Score, screen
 from ident.torque_fit import Fit, Problem, predictions
 
 SEEN = 50.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
+ALONG = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws
+LINEAR = 0.3  # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
 SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 
 
 def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray) -> list[Score]:
     """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
 
-    None where the noise is not measured by the scatter between periods, beside link encoders, of which the weights follow
-    what the model leaves, and beside a law along the record, which turns noise into a signal of its own.
+    None where the noise is not measured by the scatter between periods, nor beside link encoders, of which the weights follow
+    what the model leaves. None at the joint of a law along the record, which turns noise into a signal of its own there.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.
     """
     measured = all(g.window is None and g.U_periods.shape[1] > 1 and not g.links for g in problem.groups)
-    if not measured or any(is_along_record(e.hypothesis) for e in current.model.effects):
+    if not measured:
         return []
+    along = {e.hypothesis.joint for e in current.model.effects if is_along_record(e.hypothesis)}
+    hypotheses = [h for h in hypotheses if on_chain(h) or h.joint not in along]
     at_joints = SHADOW * np.maximum(told, 0.0)
     scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
     return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]
@@ -43,7 +47,8 @@ def seen(scores: Sequence[Score], current: Fit) -> Score | None:
     """The clearest score, if noise does not come near it by chance, nor noise that was estimated too small at its joint."""
     whole = max(1.0, current.chi2_per_dof)
     by_joint = np.maximum(current.costs / np.maximum(current.counts, 1.0), whole)
-    return next((s for s in scores if s.gain > SEEN * _at(s.hypothesis, by_joint, whole)), None)
+    least = SEEN * (ALONG if any(is_along_record(e.hypothesis) for e in current.model.effects) else 1.0)
+    return next((s for s in scores if s.gain > least * _at(s.hypothesis, by_joint, whole)), None)
 
 
 def chance(best: Score, scores: Sequence[Score]) -> float:

@@ -11,7 +11,7 @@ from ident.baseline import DETECTION_EXCESS
 from ident.diagnose import diagnose, identify
 from ident.evidence import LAW_ERROR, TEMPER, Candidate, model_error, weigh
 from ident.extended import Effect, along_record
-from ident.faint import SEEN, SHADOW, chance, faint_scores, on_chain, seen
+from ident.faint import ALONG, SEEN, SHADOW, chance, faint_scores, on_chain, seen
 from ident.hypotheses import catalogue
 from ident.search import hopeful
 from sim import parse_effect, run_experiment
@@ -93,9 +93,18 @@ def test_nothing_faint_is_sought_where_the_noise_is_not_measured(identified, hyp
     single = replace(group, U_periods=group.U_periods[:, :1], Q_periods=group.Q_periods[:, :1])
     for other in (single, replace(group, links=(1,))):
         assert faint_scores(replace(problem, groups=(other, *problem.groups[1:])), baseline, hypotheses, none) == []
-    h = along_record(next(h for h in hypotheses if h.effect == "backlash"))
-    model = replace(baseline.model, effects=(Effect(h, np.array([1e-4])),))
-    assert faint_scores(problem, replace(baseline, model=model), hypotheses, none) == []
+
+
+def test_a_law_along_the_record_hides_more_and_its_joint(identified, hypotheses):
+    setup, baseline = identified
+    h = along_record(next(h for h in hypotheses if h.key == ("backlash", "elbow_joint")))
+    model = replace(baseline.model, effects=(Effect(h, np.array([1e-7])),))
+    along = replace(baseline, model=model)
+    scores = faint_scores(setup.problem, along, hypotheses, np.zeros(6))
+    assert {s.hypothesis.joint for s in scores if not on_chain(s.hypothesis)} == set(range(6)) - {h.joint}
+    for factor, expected in ((1.2, False), (1.2 * ALONG, True)):
+        loud = [replace(scores[0], gain=factor * SEEN)]
+        assert (seen(loud, along) is not None) is expected and seen(loud, baseline) is loud[0]
 
 
 def test_a_decoy_that_outdoes_a_faint_name_belies_no_other(identified):
