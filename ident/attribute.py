@@ -503,7 +503,7 @@ def settles_its_joint(problem: Problem, current: Fit, h: Hypothesis, result: Fit
     if h.decoy or j < 0 or h.channel == "model" or current.costs[j] <= FAINT * current.counts[j]:
         return False
     own = under_own_noise(problem, result)
-    return bool(own.costs[j] <= DETECTION_EXCESS * own.counts[j])
+    return own is not None and bool(own.costs[j] <= DETECTION_EXCESS * own.counts[j])
 
 
 def beside_unclear(

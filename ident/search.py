@@ -395,7 +395,8 @@ def beside_strong(
     right = [r for (_, r), (h, _) in zip(along[:FINALISTS], told, strict=True) if not is_along_record(h)]
     strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(problem, h.joint, r, right))]
     if any(is_along_record(h) for h, _ in strong):
-        whole = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
+        own = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
+        whole = [r for r in own if r is not None]
         strong = [(h, r) for h, r in strong if not (is_along_record(h) and matched(problem, h.joint, r, whole))]
     if not left_by(strong) < left_by(ranked):
         return before, list(ranked)
@@ -468,10 +469,14 @@ def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]
     return any(excess_under(problem, joint, r, along.weights) <= left for r in others)
 
 
-def under_own_noise(problem: Problem, result: Fit) -> Fit:
-    """A fit as it stands, its cost under the noise that its own model sees."""
-    preds = predictions(problem, result.model, result.remainders)
-    return reweighted(problem, result, make_weights(problem, preds, 0.0))
+def under_own_noise(problem: Problem, result: Fit) -> Fit | None:
+    """A fit as it stands, its cost under the noise that its own model sees; None where drives gone astray make that infinite."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            preds = predictions(problem, result.model, result.remainders)
+            return reweighted(problem, result, make_weights(problem, preds, 0.0))
+    except NOT_COMPUTED:
+        return None
 
 
 def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:

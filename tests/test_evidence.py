@@ -45,6 +45,7 @@ from ident.search import (
     refit,
     reweighted,
     strong_effects,
+    under_own_noise,
 )
 from ident.torque_fit import (
     PRIOR_LOG_STD,
@@ -608,3 +609,12 @@ def test_plain_friction_widens_to_laws_that_hold_it(named):
             assert all(q.lower < v < q.upper or v == q.null for q, v in zip(h.parameters, p, strict=True))
             special = h.options["special"](p)
             assert 0.5 * size < special[0] < 2.0 * size
+
+
+def test_drives_gone_astray_have_no_noise_of_their_own(identified):
+    """A candidate whose impedance is infinite is left out where noises are compared, and settles no joint."""
+    _, setup, result = identified
+    lost = replace(result, model=replace(result.model, par=replace(result.model.par, inertia=np.full(6, np.inf))))
+    assert under_own_noise(setup.problem, lost) is None
+    own = under_own_noise(setup.problem, result)
+    assert own.cost == pytest.approx(result.cost, rel=0.05)
