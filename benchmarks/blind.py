@@ -23,7 +23,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +102,7 @@ class Case:
                     power += np.mean(np.abs(change[:lines]) ** 2, axis=0) / noise / (2 * len(some))
             return float(np.sqrt(power.max()))
 
-        return size
+        return cache(size)
 
     def scaled(self, size: Callable[[object], float], low: float, high: float) -> Case:
         """The case with each effect at a size drawn between two, as near as its strength brings it there."""
@@ -137,27 +137,26 @@ def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: s
     )
     peak = np.max([np.abs(e.r).max(axis=0) for e in plan.experiments], axis=0)
     peak = peak + np.max([np.abs(gravity_torque(plant, q)) for q in postures], axis=0)
-    draws: list[tuple[Callable, tuple[float, float]]] = []
-    if kind == "outside":
-        draws.append((lambda rng, strength: draw_outside(rng, robot, strength), (-0.5, 1.0)))
-    for i in range(COUNTS[kind]):
-        name = pool[(seed + i * 7) % len(pool)]
-        draws.append((partial(_drawn, robot=robot, name=name, peak_torque=peak), (-0.5, 0.7)))
     hidden, stronger = [], []
-    for draw, spread in draws:
-        strength = float(np.exp(rng.uniform(*spread)))
-        same = copy.deepcopy(rng)
-        hidden.append(draw(rng, strength))
-        stronger.append(partial(_again, draw, same, strength))
+    for name in [None] if kind == "outside" else [pool[(seed + i * 7) % len(pool)] for i in range(COUNTS[kind])]:
+        strength = float(np.exp(rng.uniform(-0.5, 1.0 if name is None else 0.7)))
+        stronger.append(partial(_again, copy.deepcopy(rng), robot, name, peak, strength))
+        hidden.append(_drawn(rng, robot, name, peak, strength))
     return Case(plan, hidden, stronger, draw_drives(rng, robot), float(rng.choice([2.5e-4, 2e-4])), seed)
 
 
-def _drawn(rng: np.random.Generator, strength: float, *, robot: Robot, name: str, peak_torque: np.ndarray) -> object:
-    return draw_effect(rng, robot, names=(name,), strength=strength, peak_torque=peak_torque)
+def _drawn(rng: np.random.Generator, robot: Robot, name: str | None, peak: np.ndarray, strength: float) -> object:
+    """An effect of the catalogue, or one that it lacks where there is no name."""
+    if name is None:
+        return draw_outside(rng, robot, strength)
+    return draw_effect(rng, robot, names=(name,), strength=strength, peak_torque=peak)
 
 
-def _again(draw: Callable, rng: np.random.Generator, strength: float, factor: float) -> object:
-    return draw(copy.deepcopy(rng), strength * factor)
+def _again(
+    rng: np.random.Generator, robot: Robot, name: str | None, peak: np.ndarray, strength: float, factor: float
+) -> object:
+    """What ``_drawn`` gave from this generator, its strength times a factor."""
+    return _drawn(copy.deepcopy(rng), robot, name, peak, strength * factor)
 
 
 def run_case(

@@ -29,7 +29,7 @@ from ident.evidence import (
     weigh,
 )
 from ident.extended import Effect, is_along_record
-from ident.faint import LINEAR, SEEN, chance, faint_scores, seen
+from ident.faint import SEEN, hidden
 from ident.hypotheses import Hypothesis, catalogue
 from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
@@ -81,6 +81,11 @@ class Round:
     scale: float
     explained: float
 
+    @property
+    def fall(self) -> float:
+        """Of the cost, by the winner."""
+        return self.before.cost - self.candidates[0].fit.cost
+
 
 @dataclass(frozen=True)
 class Attribution:
@@ -123,7 +128,7 @@ def attribute(
         # In motions alone offsets of the torque are found with the inertias of the links, as part of the baseline.
         hypotheses = catalogue(problem.structure, offsets=not problem.motions_alone)
     hypotheses = tuple(hypotheses)
-    p_value = discrepancy_p_value(baseline)
+    p_value = p_detected = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
     loud = p_value < level and baseline.chi2_per_dof > DETECTION_EXCESS
     current, rounds, unknown, count, looped = baseline, [], False, 0, None
@@ -134,12 +139,10 @@ def attribute(
         asked, faint = hypotheses, not loud or settled(current)
         if faint:
             workers.say("what the noise as a whole would hide")
-            scores = faint_scores(problem, current, hypotheses, baseline.costs - current.costs)
-            clear = seen(scores, current)
-            if clear is None:
+            asked, by_chance = hidden(problem, current, hypotheses, baseline.costs - current.costs)
+            if not asked:
                 break
-            asked = tuple(s.hypothesis for s in scores if s.gain >= LINEAR * clear.gain)
-            p_value = p_value if loud or rounds else chance(clear, scores)
+            p_detected = p_detected if loud or rounds else by_chance
         workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
         # What is left beside a cause is mostly what its law lacks, and no hinge; what is faint shows none everywhere.
         bare = np.inf if rounds or faint else worth_a_hinge(current)
@@ -176,23 +179,17 @@ def attribute(
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
-    if not loud and not kept:
-        p_value = discrepancy_p_value(baseline)
-    return Attribution(baseline, loud or bool(kept), p_value, kept, current, unknown)
+    return Attribution(baseline, loud or bool(kept), p_detected if kept else p_value, kept, current, unknown)
 
 
 def told_share(baseline: Fit, found: Round) -> float:
     """Share of the discrepancy of the baseline that a round explains; more than 1 of one within the error of the noise."""
-    fall = found.before.cost - found.candidates[0].fit.cost
-    return fall / max(baseline.cost - DETECTION_EXCESS * baseline.count, 1.0)
+    return found.fall / max(baseline.cost - DETECTION_EXCESS * baseline.count, 1.0)
 
 
 def answers(found: Round, least: float = MIN_EVIDENCE) -> bool:
     """Whether the best candidate of a round explains enough to be a cause, ``least`` of the scaled cost."""
-    if not found.candidates:
-        return False
-    fall = (found.before.cost - found.candidates[0].fit.cost) / found.scale
-    return fall >= least and found.explained >= MIN_SHARE
+    return bool(found.candidates) and found.fall >= least * found.scale and found.explained >= MIN_SHARE
 
 
 def with_name(found: Round) -> Round:
@@ -251,8 +248,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     for c in sorted(ran, key=lambda c: c.fit.cost):
         best_of.setdefault(c.hypothesis.key, c)
     ran = list(best_of.values())
-    told = found.before.cost - found.candidates[0].fit.cost
-    weighed = weigh(ran, model_error(min(c.fit.cost for c in ran), current.count, told))
+    weighed = weigh(ran, model_error(min(c.fit.cost for c in ran), current.count, found.fall))
     best = weighed[0]
     if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
         best = next(c for c in weighed if c.hypothesis is own.hypothesis)
@@ -500,7 +496,7 @@ def settles_its_joint(problem: Problem, current: Fit, h: Hypothesis, result: Fit
     Along the measured motion of the motors most effects reach the torque of their own joint alone.
     """
     j = h.joint
-    if h.decoy or j < 0 or h.channel == "model" or current.costs[j] <= FAINT * current.counts[j]:
+    if h.decoy or h.on_chain or current.costs[j] <= FAINT * current.counts[j]:
         return False
     own = under_own_noise(problem, result)
     return own is not None and bool(own.costs[j] <= DETECTION_EXCESS * own.counts[j])

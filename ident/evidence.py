@@ -63,7 +63,7 @@ def rivals_of_best(
     best, top = ranked[0]
     falls = before.costs - top.costs
     at = int(np.argmax(falls))
-    if best.channel == "model" or best.joint < 0 or falls[at] <= 0.0:
+    if best.on_chain or falls[at] <= 0.0:
         return ranked, model_error(top.cost, before.count, float(np.sum(falls)))
     kept = [(h, r) for h, r in ranked if before.costs[at] - r.costs[at] >= RIVAL * falls[at]]
     left = min(r.costs[at] for _, r in kept)

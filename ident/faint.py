@@ -24,6 +24,25 @@ LINEAR = 0.3  # of what the clearest explains, below which no other can be the c
 SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 
 
+def hidden(
+    problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray
+) -> tuple[tuple[Hypothesis, ...], float]:
+    """Hypotheses that may be what a model leaves within its noise, none where that shows nothing but noise.
+
+    Args:
+        told: as of ``faint_scores``.
+
+    Returns:
+        The hypotheses, and about the probability that the best of all explains so much of noise alone (Bonferroni, a trial each).
+    """
+    scores = faint_scores(problem, current, hypotheses, told)
+    clear = seen(scores, current)
+    if clear is None:
+        return (), 1.0
+    chance = min(1.0, len(scores) * scipy.stats.chi2.sf(clear.gain, clear.dof))
+    return tuple(s.hypothesis for s in scores if s.gain >= LINEAR * clear.gain), float(chance)
+
+
 def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray) -> list[Score]:
     """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
 
@@ -37,7 +56,7 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
     if not measured:
         return []
     along = {e.hypothesis.joint for e in current.model.effects if is_along_record(e.hypothesis)}
-    hypotheses = [h for h in hypotheses if on_chain(h) or h.joint not in along]
+    hypotheses = [h for h in hypotheses if h.on_chain or h.joint not in along]
     at_joints = SHADOW * np.maximum(told, 0.0)
     scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
     return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]
@@ -51,15 +70,5 @@ def seen(scores: Sequence[Score], current: Fit) -> Score | None:
     return next((s for s in scores if s.gain > least * _at(s.hypothesis, by_joint, whole)), None)
 
 
-def chance(best: Score, scores: Sequence[Score]) -> float:
-    """About the probability that the best of all hypotheses explains so much of noise alone (Bonferroni, a trial each)."""
-    return float(min(1.0, len(scores) * scipy.stats.chi2.sf(best.gain, best.dof)))
-
-
-def on_chain(h: Hypothesis) -> bool:
-    """Whether a hypothesis changes the chain, and shows at every joint."""
-    return h.joint < 0 or h.channel == "model"
-
-
 def _at(h: Hypothesis, by_joint: np.ndarray, whole: float) -> float:
-    return float(whole if on_chain(h) else by_joint[h.joint])
+    return float(whole if h.on_chain else by_joint[h.joint])

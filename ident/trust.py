@@ -9,7 +9,7 @@ import numpy as np
 from ident.attribute import UNTOLD, Attribution, Round
 from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
-from ident.faint import SHADOW, on_chain
+from ident.faint import SHADOW
 from ident.hypotheses import Hypothesis
 from ident.torque_fit import Fit, Problem
 from ident.verdict import Gain
@@ -32,7 +32,7 @@ LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause rema
 
 def _at(h: Hypothesis, costs: np.ndarray) -> float:
     """Of costs by joint, those that an effect answers for: its joint, or all where it changes the chain."""
-    return float(np.sum(costs) if on_chain(h) else costs[h.joint])
+    return float(np.sum(costs) if h.on_chain else costs[h.joint])
 
 
 def _excess(result: Fit, level: float) -> np.ndarray:
@@ -113,7 +113,7 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
         return float(x.before.costs[h.joint] - x.candidates[0].fit.costs[h.joint])
 
     h = found.candidates[0].hypothesis
-    if on_chain(h):
+    if h.on_chain:
         return False
     for other in rounds:
         o = other.candidates[0].hypothesis

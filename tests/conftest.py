@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ident.dataset_io import load_dataset, save_dataset
+from ident.diagnose import identify
 from ident.excitation import operating_points
 from robot_assets.robot import load_robot
 from sim import run_experiment
@@ -45,3 +46,9 @@ def clean(ur10, tmp_path_factory):
     drives = draw_drives(np.random.default_rng(5), ur10)
     data = run_experiment(small_plan(ur10, 5, trajectory=True), seed=5, drives=drives)
     return through_files(data, tmp_path_factory.mktemp("clean")), drives
+
+
+@pytest.fixture(scope="session")
+def identified(clean):
+    """(dataset, what was set up, baseline) of the clean experiment."""
+    return clean[0], *identify(clean[0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ident.baseline import discrepancy_p_value
-from ident.diagnose import diagnose, identify, set_up
+from ident.diagnose import diagnose, set_up
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.extended import Effect, Model, predict
 from ident.frf import estimate_frf
@@ -24,8 +24,9 @@ FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
 
 @pytest.fixture(scope="module")
-def identified(clean):
-    return identify(clean[0])
+def identified(identified):
+    """What was set up, and the baseline."""
+    return identified[1:]
 
 
 def relative_errors(par, drives):

@@ -140,6 +140,11 @@ class Hypothesis:
         return self.effect.startswith("unknown:")
 
     @property
+    def on_chain(self) -> bool:
+        """Whether it changes the chain, and shows at every joint."""
+        return self.joint < 0 or self.channel == "model"
+
+    @property
     def key(self) -> tuple[str, str]:
         return self.effect, self.place
 
