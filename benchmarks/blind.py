@@ -74,15 +74,14 @@ class Case:
         ]
 
     def sizer(self) -> Callable[[object], float]:
-        """Distortion over noise of an effect: what it alone changes at the joint that shows it most.
+        """Distortion over noise of an effect: what it alone changes at the posture and joint that show it most.
 
         Root mean square over the excited band of the change of torque and position lines, over the noise of
-        these lines, at the first posture and the largest level; the plant is simulated without noise.
+        these lines, in the first experiment at the largest level; the plant is simulated without noise.
         """
         plan, robot = self.plan, self.plan.robot
-        first = plan.experiments[0].operating_point
         top = max(e.amplitude for e in plan.experiments)
-        some = tuple(e for e in plan.experiments if (e.operating_point, e.amplitude) == (first, top))
+        some = tuple(e for e in plan.experiments if (e.experiment, e.amplitude) == (1, top))
         small = replace(plan, experiments=some, trajectories=())
         lines = int(plan.excitation.lines.max()) + 1
 
@@ -94,12 +93,12 @@ class Case:
         plain = quiet([])
 
         def size(effect: object) -> float:
-            power = np.zeros(robot.n)
-            for a, b in zip(plain, quiet([effect]), strict=True):
+            power = np.zeros((len(some), robot.n))
+            for s, (a, b) in enumerate(zip(plain, quiet([effect]), strict=True)):
                 for channel, std in (("tau", robot.array("tau_std")), ("q", robot.array("q_std"))):
                     change = scipy.fft.rfft((b.periodic(channel) - a.periodic(channel)).mean(axis=0), axis=0, norm="forward")
                     noise = std**2 / (a.period * a.steady_periods)
-                    power += np.mean(np.abs(change[:lines]) ** 2, axis=0) / noise / (2 * len(some))
+                    power[s] += np.mean(np.abs(change[:lines]) ** 2, axis=0) / noise / 2
             return float(np.sqrt(power.max()))
 
         return cache(size)

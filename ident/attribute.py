@@ -38,6 +38,7 @@ from ident.search import (
     FINALISTS,
     MIN_SHARE,
     POLISH_STEPS,
+    RECORD_EXCESS,
     STRONG,
     beside_strong,
     clip_to_bounds,
@@ -48,6 +49,7 @@ from ident.search import (
     polish,
     refit,
     reweighted,
+    settled,
     simulated,
     under_noise_of_best,
     under_own_noise,
@@ -58,7 +60,6 @@ from ident.torque_fit import Fit, Problem, predictions
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DOUBTED_LEVEL = 1e-2  # the same where the drives that fit cannot be those of this arm
-RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the record leaves no more than noise
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
@@ -303,16 +304,6 @@ def pruned(problem: Problem, current: Fit) -> Fit:
     other = polish(problem, replace(current, model=replace(current.model, effects=needed)))
     same = reweighted(problem, current, other.weights)
     return other if other.cost - same.cost < MIN_EVIDENCE * max(1.0, same.cost / same.count) else current
-
-
-def settled(current: Fit) -> bool:
-    """Whether a model leaves no more than noise, as far as that is known: along the record, by a few draws.
-
-    There the noise of one joint is taken large for all of them, so that each must leave no more.
-    """
-    if any(is_along_record(e.hypothesis) for e in current.model.effects):
-        return bool(np.all(current.costs <= RECORD_EXCESS * current.counts))
-    return current.chi2_per_dof <= DETECTION_EXCESS
 
 
 def nearly_settled(current: Fit) -> bool:

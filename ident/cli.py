@@ -66,12 +66,15 @@ def _progress(quiet: bool) -> Iterator[tuple[Callable[[str], None], Callable[[fl
     else:
         last = [-1]
 
+        def say(text: str) -> None:
+            sys.stderr.write(f"{text}\n")  # a line at once: pieces of work tell of themselves from several threads
+
         def share(done: float) -> None:
             if int(done * 10) > last[0]:
                 last[0] = int(done * 10)
-                print(f"simulated {done:.0%}", file=sys.stderr)
+                say(f"simulated {done:.0%}")
 
-        yield (lambda text: print(text, file=sys.stderr)), share
+        yield say, share
 
 
 def _robot(name: str):

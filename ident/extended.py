@@ -29,13 +29,13 @@ from ident.records import NOISE_LINES, POINTS_PER_LINE, Group, mean_over_lines
 
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of periodic data, at least
-LOOP_MOST = 6  # the same, at most: modes far above the signals follow at once
+LOOP_MOST = 3  # the same, at most: modes far above the signals follow at once
 RECORD_AGREED = 1e-5  # step over the deflection that ends them
 RECORD_STEPS = 20  # towards the deflection that agrees with a record
 NOISE_DRAWS = 4  # of the noise that a gear along its record answers to
 LEAST_GAIN = 1e-3  # of a gear, torque at the motor per torque in parallel with its spring, that noise is divided by
 RECORD_BISECTIONS = 30  # of its mean
-LOOP_STEP = 0.25  # its step, at most, over the time scale of the fastest mode
+LOOP_STEP = 0.5  # its step, at most, over the time scale of the fastest mode
 
 
 @dataclass(frozen=True)
@@ -378,7 +378,7 @@ def _along_record(
     The former moves the links; the latter is as it reaches the motor. The law is asked at the deflection that agrees
     best with two measurements: the one that the recorded torque gives through the open compliance of the link, whose
     noise is large where that is, and the one at which the law gives this torque, whose noise is large where the
-    gear is soft. Steps of least squares, with the largest slope of the law for its slope.
+    gear is soft. Steps of least squares, with the largest slope of the law and the gear's damper for its slope.
 
     Args:
         j, c: joint, and its link coordinate; others: (S, L) torque of other laws of the same gear; motor: (S, L, n)
@@ -399,9 +399,10 @@ def _along_record(
         along = kernels.along_deflection(*law, group.to_time(x[..., None])[..., 0], mean, bisections)
         return group.to_lines(along[..., None])[..., 0]
 
-    slope = kernels.largest_slope(law, float(np.abs(group.to_time(known[..., None])).max()))
+    # What the damper adds at high frequency belongs to it: steps over the spring alone would run away there.
+    slope = plane.C[:, j] - law.k + kernels.largest_slope(law, float(np.abs(group.to_time(known[..., None])).max()))
     trust = np.ones(len(gain))  # of the law's measurement, against that through the link
-    trust[1:] = np.abs(link * slope) ** 2 / (1.0 + np.abs(link * slope) ** 2)
+    trust[1:] = np.abs(link * slope[1:]) ** 2 / (1.0 + np.abs(link * slope[1:]) ** 2)
     x = known
     for _ in range(RECORD_STEPS):
         miss = carried - plane.C[:, j] * x - torque_at(x, 0)

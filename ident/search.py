@@ -43,6 +43,7 @@ ANSWERED = 0.2  # share of the excess that the best may leave after the first st
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
 HOPEFUL = 5  # candidates fitted further after the first steps
 AS_GOOD = 0.8  # cost of a loop over that along the record, below which it is the loop that is right
+RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the record leaves no more than noise
 CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
@@ -370,7 +371,8 @@ def beside_strong(
     them the noise that the model passes on: a joint that sticks looks like one without motor inertia.
     Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
     gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
-    as loops where these do as well.
+    as loops where these do as well. Those at the joint of the best candidate come first, and last where its own law leaves
+    noise alone.
 
     Args:
         quiet: joints at which none is sought.
@@ -384,11 +386,17 @@ def beside_strong(
         except NOT_COMPUTED:
             return None
 
-    likely = min(ranked, key=lambda x: x[1].cost)[0].joint if ranked else -1
+    first = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
+    likely = first.joint if first is not None else -1
     chosen = strong_effects(problem, before, scores, likely, quiet)
     chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
-    fits = workers.map_in_time(annealed, chosen, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
-    pairs = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r and not pointless(r.model.effects[-1])]
+    pairs: list[tuple[Hypothesis, Fit]] = []
+    for here in (True, False):
+        some = [s for s in chosen if (s.hypothesis.joint == likely) == here]
+        fits = workers.map_in_time(annealed, some, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+        pairs += [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not pointless(r.model.effects[-1])]
+        if any(settled(r) for h, r in pairs if first is not None and h.key == first.key):
+            break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
     told = workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
@@ -430,6 +438,16 @@ def strong_effects(
         and "size" in s.hypothesis.options
         and not (problem.motions_alone and s.hypothesis.channel == "spring")
     ]
+
+
+def settled(current: Fit) -> bool:
+    """Whether a model leaves no more than noise, as far as that is known: along the record, by a few draws.
+
+    There the noise of one joint is taken large for all of them, so that each must leave no more.
+    """
+    if any(is_along_record(e.hypothesis) for e in current.model.effects):
+        return bool(np.all(current.costs <= RECORD_EXCESS * current.counts))
+    return current.chi2_per_dof <= DETECTION_EXCESS
 
 
 def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> bool:

@@ -106,6 +106,19 @@ def test_a_gear_that_rattles_is_explained_along_its_record_alone(rattling):
     assert is_along_record(kept)
 
 
+def test_the_deflection_along_a_record_is_found_beside_a_strong_damper(rattling, monkeypatch):
+    """At high frequency the damper is stiffer than the spring; ten times as many steps hardly change it."""
+    problem, model, backlash, gap = rattling
+    par = replace(model.par, damping=30.0 * model.par.damping)
+    group = problem.groups[0]
+    assert group.omega[-1] * par.damping[0] > 2.0 * par.stiffness[0]
+    model = replace(model, par=par, effects=(Effect(along_record(backlash), np.array([gap])),))
+    few = predict(model, group, problem.sampling).outputs(group)[..., 0]
+    monkeypatch.setattr("ident.extended.RECORD_STEPS", 200)
+    many = predict(model, group, problem.sampling).outputs(group)[..., 0]
+    assert np.linalg.norm(few - many) < 0.02 * np.linalg.norm(many)
+
+
 def test_columns_beside_a_gear_along_its_record_are_the_differences(rattling):
     """Of the gear, its motor, the timing and friction at the same joint, whose torque the record holds already."""
     problem, model, backlash, gap = rattling

@@ -87,6 +87,15 @@ def test_where_a_loop_begins_does_not_matter(name):
     assert loop(LAWS[name], X, near) == pytest.approx(cold, abs=2e-4 * np.abs(cold).max())
 
 
+def test_an_element_that_hardly_yields_is_followed_to_where_it_creeps(monkeypatch):
+    """The mean of its torque moves a little in each period, for hundreds of them where it is only run on."""
+    X = free_motion(6)
+    law = kernels.Law(kernels.HYSTERESIS, 1e3, 2.0, 4e3, 10.0)
+    found = loop(law, X)
+    monkeypatch.setattr("ident.hypotheses.loop.SWEEPS", 500)
+    assert found == pytest.approx(loop(law, X), abs=1e-6 * np.abs(found).max())
+
+
 def test_records_do_not_see_each_other():
     X = free_motion(4)
     together = loop(LAWS["cable"], X)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.hypotheses.kernels import CABLE, LINK, Law, loop_sweep, spring_torque
+from ident.hypotheses.kernels import CABLE, HYSTERESIS, LINK, Law, loop_sweep, spring_torque
 from ident.mixing import MEMORY, mixed
 
 SWEEPS = 25  # periods at most until the steady state
@@ -19,7 +19,8 @@ def steady_loop(
     ``x = linear - r * h(x, x')`` with ``r`` the compliance of the arm at the law, as a sum of modes stepped
     with a first-order hold: ``x+ = decay x + gain_old h + gain_new h+``. The velocity is that of the modes
     (residues add up to zero: a torque does not step a velocity). Records are stepped side by side, each until it
-    repeats; where a sweep begins is mixed from those before.
+    repeats; where a sweep begins is mixed from those before, and with it what a law remembers: an element that hardly
+    yields creeps for many periods.
 
     Args:
         linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
@@ -28,6 +29,8 @@ def steady_loop(
     """
     code, a, b, k = law[:4]
     S, T = linear.shape
+    remembers = code in (HYSTERESIS, CABLE)
+    unit = np.array([[1.0], [1.0], [k]])  # of what is remembered, in which it is a deflection
     poles, decay, _, _ = modes
     whole = (decay**T)[:, None]
     linear, rate = np.ascontiguousarray(linear.T), np.ascontiguousarray(rate.T)
@@ -43,10 +46,13 @@ def steady_loop(
     out, part = np.zeros((T, S)), np.zeros((T, S))
     past: list[tuple[np.ndarray, np.ndarray]] = []
     for sweep in range(SWEEPS):
+        before = memory.copy()
         end, change = loop_sweep(*law, linear, rate, modes, start, memory, part)
         # The state that the torque of this period repeats.
         move = (end - whole * start) / (1.0 - whole) - start
         moving = change > STEADY if sweep else np.ones(len(left), bool)
+        if remembers:
+            start, move = np.vstack([start, before / unit]), np.vstack([move, (memory - before) / unit])
         past = [*past[-MEMORY:], (start.T, move.T)]
         if not np.all(moving):
             out[:, left[~moving]] = part[:, ~moving]
@@ -56,6 +62,11 @@ def steady_loop(
         if not len(left):
             break
         start = np.ascontiguousarray(mixed(past).T)
+        if remembers:
+            memory = unit * start[len(decay) :].real
+            if code == HYSTERESIS:
+                memory[2] = np.clip(memory[2], -b, b)
+            start = start[: len(decay)].copy()
     out[:, left] = part
     return out.T.copy()
 

@@ -52,28 +52,41 @@ def yielded(k: float, limit: float, n: float, recoil: float, h: float, dx: float
     By exponential steps, the law being linearised where each begins (Rosenbrock-Euler): of second order, stable for any
     ``dx``, and exact for Dahl's bristle.
     """
+    return _yielded(k, limit, n, recoil, (abs(h) / limit) ** n, h, dx)
+
+
+@njit(cache=True, nogil=True)
+def _yielded(k: float, limit: float, n: float, recoil: float, power: float, h: float, dx: float) -> tuple[float, float]:
+    """``yielded``, given the power ``w^n`` of where the step begins."""
     if n >= SLIP:
         new = h + k * dx
         if abs(new) > limit:
             return (limit if new > 0 else -limit), 0.0
         return new, k
     sign = 1.0 if dx > 0 else -1.0
-    path, w = k * abs(dx) / limit, sign * h / limit
+    path, w, on = k * abs(dx) / limit, sign * h / limit, power
     if w < 0.0:
-        back = recoil * (-w) ** n if recoil > 0.0 else 0.0
-        bend = n * back / -w * path
-        lost = np.expm1(-bend)
-        gone = (1.0 + back) * (-lost / bend if bend > 1e-8 else 1.0) * path
+        back = recoil * power
+        lost, share = _decay(n * back / -w * path)
+        gone = (1.0 + back) * share * path
         if gone <= -w:
             return sign * limit * (w + gone), k * (1.0 + back) * (1.0 + lost)
-        path, w = path * (1.0 + w / gone), 0.0
-    on = w**n if w > 0.0 else 0.0
-    bend = (n * on / w if w > 0.0 else (1.0 if n == 1.0 else 0.0)) * path
-    lost = np.expm1(-bend)
-    w += (1.0 - on) * (-lost / bend if bend > 1e-8 else 1.0) * path
+        path, w, on = path * (1.0 + w / gone), 0.0, 0.0
+    lost, share = _decay((n * on / w if w > 0.0 else (1.0 if n == 1.0 else 0.0)) * path)
+    w += (1.0 - on) * share * path
     if w >= 1.0:
         return sign * limit, 0.0
     return sign * limit * w, k * (1.0 - on) * (1.0 + lost)
+
+
+@njit(cache=True, nogil=True)
+def _decay(x: float) -> tuple[float, float]:
+    """``exp(-x) - 1``, and that over ``-x``; by a series where ``x`` is small, as it is but where an element yields."""
+    if x < 1e-4:
+        share = 1.0 - 0.5 * x * (1.0 - x / 3.0)
+        return -x * share, share
+    lost = np.expm1(-x)
+    return lost, -lost / x
 
 
 @njit(cache=True, nogil=True)
@@ -86,9 +99,9 @@ def yielding_point(
     """
     low, high = free - direct * limit, free + direct * limit
     dx = min(max(near, low), high)
-    torque = h
+    torque, power = h, (abs(h) / limit) ** n
     for _ in range(60):
-        torque, slope = yielded(k, limit, n, recoil, h, dx)
+        torque, slope = _yielded(k, limit, n, recoil, power, h, dx)
         miss = dx + direct * torque - free
         if miss > 0.0:
             high = dx
