@@ -219,7 +219,7 @@ def predict_at(
     along = joints_along_record(model, group)
     inner.sort(key=lambda e: e.hypothesis.joint in along and is_along_record(e.hypothesis))  # after what else is at the gear
     react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor, along=along) if inner else None
-    passes = 1 if len(inner) == 1 and _closes_itself(inner[0]) else REACTION_STEPS
+    passes = 1 if len(inner) == 1 and has_loop(inner[0]) else REACTION_STEPS
     start = torques if inner else Torques()
     solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps)
     if motor:
@@ -275,7 +275,7 @@ def _inner_torques(
     loops = []
     for effect in effects:
         h, j = effect.hypothesis, effect.hypothesis.joint
-        if _closes_itself(effect):
+        if has_loop(effect):
             loops.append(effect)
         elif h.options.get("kinematic"):
             error, torque = h.law(effect.p, motion, j, par.stiffness[j])
@@ -416,8 +416,8 @@ def _along_record(
     return said, gain * (torque - said)
 
 
-def _closes_itself(effect: Effect) -> bool:
-    """Whether an effect's loop is solved in one pass."""
+def has_loop(effect: Effect) -> bool:
+    """Whether an effect moves the arm by which it is moved: a loop, solved in one pass."""
     return effect.hypothesis.gear_law or "loop" in effect.hypothesis.options
 
 

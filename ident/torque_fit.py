@@ -14,7 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.columns import Columns
-from ident.extended import Effect, Model, Prediction, beside, joints_along_record, predict, predict_at, through_drives
+from ident.extended import (
+    Effect,
+    Model,
+    Prediction,
+    beside,
+    has_loop,
+    joints_along_record,
+    predict,
+    predict_at,
+    through_drives,
+)
 from ident.graybox import Parameters, Structure, parameter_names
 from ident.inverse import Motion, Sampling, Torques, baseline_products
 from ident.noise import residual_covariance, white_covariance
@@ -39,6 +49,8 @@ LEAK = 0.03  # of the largest share of that noise, that is in any direction too
 LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
 SHORTER = 64.0  # factor on the damping of steps then
 SETTLING_STEPS = 12  # of the remainder, before that
+SLIGHT = 2.0  # fall of the cost that tells nothing
+FORETOLD = 0.1  # error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
 
 
 @dataclass(frozen=True)
@@ -532,8 +544,13 @@ def fit(
     converged = False
     exact = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
     fine = False  # whether the steps are by exact derivatives already
+    # Columns beside loops take most of the time: each is a periodic motion of its own.
+    slow = any(has_loop(e) for e in model.effects)
+    columns: list[Columns] = []
     for _ in range(iterations):
-        H, b = _normal(problem, model, preds, weights, exact=fine)
+        fresh = not columns
+        columns = columns or _jacobians(problem, model, preds, exact=fine)
+        H, b = _normal(problem, columns, preds, weights)
         off = x - center
         H_p, b_p = H + np.diag(prior), b - prior * off
         size = np.diag(H_p).copy()
@@ -553,17 +570,20 @@ def fit(
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                 new_cost = np.inf
             penalty = np.sum(prior * ((off + step) ** 2 - off**2))
-            if np.isfinite(new_cost) and new_cost + penalty < cost:
-                improved = True
+            foretold = float(2.0 * b @ step - step @ H @ step)
+            improved = bool(np.isfinite(new_cost) and new_cost + penalty < cost)
+            if improved or (slow and foretold < SLIGHT):
                 break
             damping = max(damping, 1e-4) * 8
         if not improved:
-            converged = fine == exact
+            converged = fresh and fine == exact
             if converged:
                 break
-            fine, damping = True, 1e-3
+            fine, damping, columns = fine if not fresh else True, 1e-3, []
             continue
         gain = cost - new_cost
+        if not (slow and abs(gain - foretold) <= max(FORETOLD * foretold, SLIGHT)):
+            columns = []
         drift += np.abs(pack(trial) - x)
         model, x = trial, pack(trial)
         damping = max(damping / 10, 1e-9)
@@ -573,7 +593,7 @@ def fit(
             model, preds, Ws, cost = settled
             x, drift = pack(model), np.zeros(len(x))
             if settled is kept:
-                damping = max(damping, 1e-4) * SHORTER
+                damping, columns = max(damping, 1e-4) * SHORTER, []
                 continue
         if progress is not None:
             progress(f"fit: chi2/dof {cost / count:.3g}")
@@ -581,10 +601,12 @@ def fit(
             converged = fine == exact
             if converged:
                 break
-            fine = True
+            fine, columns = True, []
     if np.any(drift):
         model, preds, Ws, _ = _settled(problem, settled, model, weights)
-    H, _ = _normal(problem, model, preds, weights, exact=exact)
+    if fine != exact or not columns:
+        columns = _jacobians(problem, model, preds, exact=exact)
+    H, _ = _normal(problem, columns, preds, weights)
     return Fit(model, joint_costs(problem, preds, weights), data_counts(problem), H, coordinate_names(model), tuple(Ws), weights, converged)
 
 
@@ -693,15 +715,20 @@ def _by_joint(problem: Problem, each: Sequence[np.ndarray]) -> np.ndarray:
     return total
 
 
+def _jacobians(problem: Problem, model: Model, preds: Sequence[Prediction], *, exact: bool) -> list[Columns]:
+    """``jacobian`` of all groups."""
+    return map_threads(lambda x: jacobian(problem, model, *x, exact=exact), zip(problem.groups, preds, strict=True))
+
+
 def _normal(
-    problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights, *, exact: bool
+    problem: Problem, columns: Sequence[Columns], preds: Sequence[Prediction], weights: Weights
 ) -> tuple[np.ndarray, np.ndarray]:
     def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
-        group, pred = problem.groups[g], preds[g]
-        columns, error = jacobian(problem, model, group, pred, exact=exact), output_error(group, pred)
+        group = problem.groups[g]
+        error = output_error(group, preds[g])
         if group.window is None:
-            return columns.normal(weights.whiten[g], error)
-        J = as_real(weights.apply(g, group.observe_outputs(columns.dense())))
+            return columns[g].normal(weights.whiten[g], error)
+        J = as_real(weights.apply(g, group.observe_outputs(columns[g].dense())))
         r = as_real(weights.apply(g, error)[..., None])[:, 0]
         return J.T @ J, J.T @ r
 

@@ -88,6 +88,7 @@ def test_friction_of_every_joint_counts_once(ur10, tmp_path):
     assert verdict.gain.gap_closed > 0.9
 
 
+@pytest.mark.slow
 def test_a_cable_that_gives_before_it_slips_is_named_with_its_friction(ur10, tmp_path):
     """The plant of the other tests has cables whose friction turns over with the velocity; here it does with the path."""
     from collections.abc import Callable
