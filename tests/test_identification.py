@@ -14,7 +14,7 @@ from ident.gain import segment_errors
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
 from ident.screening import screen
-from ident.torque_fit import fit, jacobian, output_error, pack, predictions, unpack
+from ident.torque_fit import SLIGHT, fit, jacobian, output_error, pack, predictions, unpack
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
@@ -196,3 +196,23 @@ def test_a_winner_beside_a_law_of_the_gear_is_fitted_by_exact_columns(panda_prob
     size = np.sqrt(np.diag(result.information))
     off = {e: np.abs((result.information - H) / np.outer(size, size)).max() for e, H in of_columns.items()}
     assert off[exact] < 1e-3 < off[not exact]
+
+
+def test_columns_beside_a_loop_serve_as_long_as_they_foretell_the_cost(panda_problem, monkeypatch):
+    """Fewer of them lead to where new ones in every step lead; what has no loop gets new ones in every step."""
+    problem, calls = panda_problem, []
+    monkeypatch.setattr("ident.torque_fit.jacobian", lambda *a, **k: calls.append(1) or jacobian(*a, **k))
+
+    def fitted(key, value):
+        (h,) = (h for h in catalogue(problem.structure) if h.key == key)
+        calls.clear()
+        result = fit(problem, Model(problem.structure, problem.nominal, (Effect(h, np.array(value)),)), iterations=20)
+        return result, len(calls) / len(problem.groups)
+
+    (kept, some), (_, plain) = fitted(GEAR, [1e9]), fitted(LAG, [2e-3])
+    monkeypatch.setattr("ident.torque_fit.SLIGHT", 0.0)
+    monkeypatch.setattr("ident.torque_fit.FORETOLD", 0.0)
+    fresh, every = fitted(GEAR, [1e9])
+    assert some < 0.8 * every
+    assert kept.cost - fresh.cost < SLIGHT
+    assert fitted(LAG, [2e-3])[1] == plain
