@@ -10,6 +10,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 
 NAMED = 0.5  # probability above which a cause counts as named
 TIED = 0.2  # probability above which an alternative counts as tied with the first
@@ -140,6 +141,9 @@ def _detection(ax, rows: list[dict]) -> None:
                 x.append(max(row["truth"][0]["size"], 1e-2))
                 y.append(max((c["probability"] for c in row["causes"]), default=0.0))
         ax.semilogx(x, y, marker, color=color, label=label, alpha=0.7)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel("distortion over noise")
     ax.set_ylabel("probability of the first name")
     ax.set_ylim(-0.03, 1.03)

@@ -18,7 +18,7 @@ from ident.hypotheses import Hypothesis
 from ident.screening import Score, screen
 from ident.torque_fit import Fit, Problem, predictions
 
-SEEN = 50.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
+SEEN = 32.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
 ALONG = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws
 LINEAR = 0.3  # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
 SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws

@@ -27,7 +27,7 @@ from ident.diagnose import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
 from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
-from ident.hypotheses.hypothesis import LOG_SPREAD
+from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.parallel import Workers
 from ident.reporting import frf_views
@@ -614,3 +614,11 @@ def test_drives_gone_astray_have_no_noise_of_their_own(identified):
     assert under_own_noise(setup.problem, lost) is None
     own = under_own_noise(setup.problem, result)
     assert own.cost == pytest.approx(result.cost, rel=0.05)
+
+
+@pytest.mark.parametrize(("unit", "spread"), [("rad", 1e-4), ("1", 0.2 / np.sqrt(12.0))])
+def test_bounds_say_how_large_a_pure_number_may_be_and_no_other(unit, spread):
+    """Those of an amplitude keep it finite: charged for them a small eccentricity of an encoder had lost against a link's inertia."""
+    q = Parameter("sine", unit, -0.1, 0.1)
+    assert q.expected_spread(-1e-4) == pytest.approx(spread)
+    assert q.bounded == (unit == "1")

@@ -59,7 +59,12 @@ class Parameter:
     @property
     def bounded(self) -> bool:
         """Whether something is said of its spread before the data."""
-        return bool(np.isfinite(self.spread) or self.upper - self.lower <= UNIT_RANGE)
+        return bool(np.isfinite(self.spread) or self._pure)
+
+    @property
+    def _pure(self) -> bool:
+        """Whether bounds say it. Those of a number with a unit are only there to keep it finite."""
+        return self.unit == "1" and self.upper - self.lower <= UNIT_RANGE
 
     def expected_spread(self, value: float) -> float:
         """Standard deviation before the data, fitted coordinates: of the size of the value where nothing is said."""
@@ -67,7 +72,7 @@ class Parameter:
             return self.spread
         if self.log:
             return LOG_SPREAD
-        if self.upper - self.lower <= UNIT_RANGE:
+        if self._pure:
             return (self.upper - self.lower) / np.sqrt(12.0)
         return max(abs(value), 1e-300)
 
