@@ -386,8 +386,8 @@ def beside_strong(
         except NOT_COMPUTED:
             return None
 
-    first = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
-    likely = first.joint if first is not None else -1
+    top = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
+    likely, key = (top.joint, top.key) if top else (-1, None)
     chosen = strong_effects(problem, before, scores, likely, quiet)
     chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
     pairs: list[tuple[Hypothesis, Fit]] = []
@@ -395,7 +395,7 @@ def beside_strong(
         some = [s for s in chosen if (s.hypothesis.joint == likely) == here]
         fits = workers.map_in_time(annealed, some, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
         pairs += [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not pointless(r.model.effects[-1])]
-        if any(settled(r) for h, r in pairs if first is not None and h.key == first.key):
+        if any(h.key == key and settled(r) for h, r in pairs):
             break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)

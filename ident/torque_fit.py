@@ -555,7 +555,6 @@ def fit(
         H_p, b_p = H + np.diag(prior), b - prior * off
         size = np.diag(H_p).copy()
         size[size <= 0] = 1.0
-        improved = False
         for _ in range(6):
             step = np.linalg.solve(H_p + damping * np.diag(size), b_p)
             step[:m] = np.clip(step[:m], -1.0, 1.0)

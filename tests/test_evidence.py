@@ -31,7 +31,7 @@ from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity
 from ident.parallel import Workers
 from ident.reporting import frf_views
-from ident.screening import _Field, _gain, _line_sums, _Stage, _whole_sums, screen
+from ident.screening import Score, _Field, _gain, _line_sums, _Stage, _whole_sums, screen
 from ident.search import (
     PER_EFFECT,
     STRONG,
@@ -622,3 +622,26 @@ def test_bounds_say_how_large_a_pure_number_may_be_and_no_other(unit, spread):
     q = Parameter("sine", unit, -0.1, 0.1)
     assert q.expected_spread(-1e-4) == pytest.approx(spread)
     assert q.bounded == (unit == "1")
+
+
+@pytest.mark.parametrize(("left", "joints"), [(1.0, {2}), (2.0, {2, 4})])
+def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(identified, monkeypatch, left, joints):
+    """At the joint of the best candidate laws are fitted first; at others only where its own leaves more than noise."""
+    _, setup, baseline = identified
+    laws = {h.key: h for h in catalogue(setup.problem.structure)}
+    backlash, other = laws["backlash", "elbow_joint"], laws["backlash", "wrist_2_joint"]
+    tried = set()
+
+    def annealed(problem, start, **options):
+        tried.add(start.effects[-1].hypothesis.joint)
+        return replace(baseline, model=start, costs=left * baseline.counts)
+
+    scores = [Score(h, 1.0, 1, np.array([1e-4]), np.ones(1), ()) for h in (other, backlash)]
+    monkeypatch.setattr("ident.search.strong_effects", lambda *args: scores)
+    monkeypatch.setattr("ident.search.anneal", annealed)
+    monkeypatch.setattr("ident.search.simulated", lambda problem, h, result: (h, result))
+    monkeypatch.setattr("ident.search.under_own_noise", lambda problem, result: None)
+    monkeypatch.setattr("ident.search.implausible", lambda problem, result: False)
+    loud = replace(baseline, costs=10.0 * baseline.counts)
+    beside_strong(setup.problem, loud, [(backlash, replace(loud, costs=5.0 * baseline.counts))], [], Workers())
+    assert tried == joints
