@@ -14,8 +14,9 @@ import numpy as np
 
 from ident.extended import Prediction
 from ident.hypotheses import Hypothesis, SignalScale
-from ident.inverse import Motion
+from ident.inverse import Motion, geometric_remainder
 from ident.parallel import map_threads
+from ident.records import Group
 from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
@@ -25,6 +26,7 @@ WAVES_AT_ONCE = 260
 FEWEST = 20  # samples in which a wave must lie in the compared band
 FOLLOWED = 0.1  # share of the path of a motion along which a ripple must, for its wave number to be looked for
 REFINED_SAMPLES = 3000  # that wave numbers are refined with
+MOVED = 1e-3  # rad, by which the arm is put elsewhere to see what its posture does
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,8 @@ def screen(
 class _Stage:
     """What all hypotheses are held against: whitened residual, fitted coordinates, normal matrix.
 
-    ``residuals`` (S, K, n) and ``columns`` (S, K, n, p) per group, complex.
+    ``residuals`` (S, K, n), ``columns`` (S, K, n, p) and ``moved`` (S, K, n, joints) per group, complex; the last is what
+    a constant unit torque in a gear does by the posture to which it moves the arm, none for motions.
     """
 
     problem: Problem
@@ -104,24 +107,30 @@ class _Stage:
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
     columns: tuple[np.ndarray, ...]
+    moved: tuple[np.ndarray | None, ...]
     inverse: np.ndarray
     moment: np.ndarray
 
     @classmethod
     def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
-        def whitened(g: int) -> tuple[np.ndarray, np.ndarray]:
+        def whitened(g: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
             group, pred = problem.groups[g], predictions[g]
-            J = group.observe_outputs(jacobian(problem, fit.model, group, pred).dense())
-            return fit.weights.apply(g, output_error(group, pred)), fit.weights.apply(g, J)
+            J = fit.weights.apply(g, group.observe_outputs(jacobian(problem, fit.model, group, pred).dense()))
+            moved = None
+            if group.window is None:
+                moved = fit.weights.apply(g, group.observe_outputs(moved_by_gears(group, pred)))
+                sag = pred.par.stiffness * pred.solution.delta[:, 0].real
+                J[..., : problem.structure.n] += moved * sag[:, None, None, :]
+            return fit.weights.apply(g, output_error(group, pred)), J, moved
 
-        residuals, columns = zip(*map_threads(whitened, range(len(problem.groups))), strict=True)
+        residuals, columns, moved = zip(*map_threads(whitened, range(len(problem.groups))), strict=True)
         real = [as_real(J) for J in columns]
         H = sum(J.T @ J for J in real)
         moment = sum(J.T @ as_real(r[..., None])[:, 0] for J, r in zip(real, residuals, strict=True))
         size = np.sqrt(np.maximum(np.diag(H), 1e-30))
         inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-10, hermitian=True) / np.outer(size, size)
         motions = tuple(pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True))
-        return cls(problem, fit, predictions, motions, residuals, columns, inverse, moment)
+        return cls(problem, fit, predictions, motions, residuals, columns, moved, inverse, moment)
 
 
 @dataclass(frozen=True)
@@ -142,12 +151,17 @@ class _Field:
     """How a torque signal of one channel shows in a group: whitened torque per signal, (K, n).
 
     ``residual`` (S, K) and ``columns`` (S, K, p) are the stage seen along it, so that a signal costs
-    no more than its own lines.
+    no more than its own lines. Its mean also moves the arm to another posture, where it answers all lines otherwise:
+    ``moved`` (S, K, n) per unit of the mean, ``moved_residual`` (S,) and ``moved_columns`` (S, p) the stage seen along
+    that; nothing of motors and drives.
     """
 
     torque: np.ndarray
     residual: np.ndarray
     columns: np.ndarray
+    moved: np.ndarray
+    moved_residual: np.ndarray
+    moved_columns: np.ndarray
 
     @classmethod
     def build(cls, stage: _Stage, g: int, channel: str, joint: int) -> _Field:
@@ -155,7 +169,11 @@ class _Field:
         torque = stage.fit.weights.apply(g, _gain(pred, channel, joint)[None, : group.n_compared])[0]
         residual = np.einsum("kn,skn->sk", torque.conj(), stage.residuals[g])
         columns = np.matmul(torque.conj()[:, None, :], stage.columns[g])[..., 0, :]
-        return cls(torque, residual, columns)
+        moved = stage.moved[g] @ _share_of_gears(pred, channel, joint)
+        seen = moved.conj().reshape(len(moved), 1, -1)
+        moved_columns = np.matmul(seen, stage.columns[g].reshape(len(moved), -1, columns.shape[-1]))[:, 0].real
+        moved_residual = np.matmul(seen, stage.residuals[g].reshape(len(moved), -1, 1))[:, 0, 0].real
+        return cls(torque, residual, columns, moved, moved_residual, moved_columns)
 
 
 def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequence[SignalScale]) -> list[Score]:
@@ -226,13 +244,18 @@ def _line_sums(parts: Sequence[tuple[_Field, np.ndarray]]) -> _Sums:
     """Sums of signals (S, K, m) that act through fields at the same time, line by line."""
     own, with_residual, with_columns = 0.0, 0.0, 0.0
     for field, X in parts:
-        flat = X.reshape(-1, X.shape[-1])
+        flat, mean = X.reshape(-1, X.shape[-1]), X[:, 0].real
         for other, Y in parts:
             weight = np.sum(field.torque.conj() * other.torque, axis=-1)[:, None]
             own = own + (flat.conj().T @ (weight * Y).reshape(flat.shape)).real
-        with_residual = with_residual + (flat.conj().T @ field.residual.ravel()).real
+            if np.any(other.moved):
+                along = np.einsum("kn,skn->sk", field.torque.conj(), other.moved)
+                across = np.einsum("skm,sk->sm", X.conj(), along).real.T @ Y[:, 0].real
+                both = np.sum(field.moved.conj() * other.moved, axis=(1, 2)).real
+                own = own + across + across.T + mean.T @ (both[:, None] * Y[:, 0].real)
+        with_residual = with_residual + (flat.conj().T @ field.residual.ravel()).real + mean.T @ field.moved_residual
         columns = field.columns.reshape(len(flat), -1)
-        with_columns = with_columns + (columns.conj().T @ flat).real
+        with_columns = with_columns + (columns.conj().T @ flat).real + field.moved_columns.T @ mean
     return _Sums(own, with_residual, with_columns)
 
 
@@ -256,6 +279,40 @@ def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:
         return plane.output_per_position[:, :, joint]
     lines, outputs, _ = plane.output_per_motor.shape
     return np.broadcast_to(np.eye(outputs, dtype=complex)[joint], (lines, outputs))
+
+
+def moved_by_gears(group: Group, pred: Prediction) -> np.ndarray:
+    """What a constant torque of 1 N m in a gear does to the outputs by the posture to which it moves the arm.
+
+    A gear that gives a little under the weight of the arm hardly changes the torque that holds it up, and all that the arm
+    does elsewhere: its inertia there is another. By differences of the geometric remainder, the motion held.
+
+    Returns:
+        (S, L, n + M, joints) outputs per N m, beyond those of the linear arm.
+    """
+    plane, solution = pred.plane, pred.solution
+    here = geometric_remainder(pred.structure, plane, group, solution.Q_a)
+    out = []
+    for column in pred.structure.driven:
+        way = plane.A_inv[0, :, column].real
+        step = MOVED / np.abs(way).max()
+        there = solution.Q_a.copy()
+        there[:, 0] += step * way
+        change = (geometric_remainder(pred.structure, plane, group, there) - here) / step
+        out.append(np.matmul(plane.output_per_load, change[..., None])[..., 0])
+    return np.stack(out, axis=-1)
+
+
+def _share_of_gears(pred: Prediction, channel: str, joint: int) -> np.ndarray:
+    """(joints,) constant torques in the gears that move the arm as the mean of a signal of a channel at a joint does."""
+    each = np.eye(pred.structure.n)[joint]
+    if channel == "spring":
+        return each
+    if channel == "link":
+        return -each
+    if channel == "position":
+        return pred.plane.C[0].real * pred.par.coupling[:, joint]
+    return 0.0 * each
 
 
 def wave_numbers(problem: Problem, predictions: Sequence[Prediction], joint: int) -> tuple[float, ...]:

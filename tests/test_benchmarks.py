@@ -32,3 +32,14 @@ def test_an_effect_is_brought_to_its_size(at_one, power, bend, target):
 
 def test_the_nearest_of_an_effect_that_does_not_come_there():
     assert brought_to(lambda factor: factor, lambda strength: 200.0 + strength, 10.0) < 0.1
+
+
+@given(limit=st.floats(-3.0, 3.0), target=st.floats(3.0, 100.0))
+def test_an_effect_that_does_nothing_up_to_a_strength_and_soon_too_much(limit, target):
+    """As a torque limit, beyond which the arm falls: it is sought between."""
+
+    def size(strength: float) -> float:
+        over = np.log(strength) - limit
+        return 0.0 if over < 0.0 else np.inf if over > 0.6 else 200.0 * over
+
+    assert 0.5 < size(brought_to(lambda factor: factor, size, target)) / target < 2.0

@@ -28,10 +28,21 @@ from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained,
 from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
-from ident.hypotheses.sensing import encoder_eccentricity
+from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.parallel import Workers
 from ident.reporting import frf_views
-from ident.screening import Score, _Field, _gain, _line_sums, _Stage, _whole_sums, screen
+from ident.screening import (
+    Score,
+    _Field,
+    _gain,
+    _line_sums,
+    _lines,
+    _share_of_gears,
+    _Stage,
+    _whole_sums,
+    moved_by_gears,
+    screen,
+)
 from ident.search import (
     PER_EFFECT,
     STRONG,
@@ -207,10 +218,35 @@ def test_signals_summed_line_by_line_are_those_of_whole_torques(identified, chan
     X, M = (rng.normal(size=shape) + 1j * rng.normal(size=shape) for _ in range(2))
     parts = [(channel, X), ("motor", M)]
     quick = _line_sums([(_Field.build(stage, 0, c, 3), x[:, : group.n_compared]) for c, x in parts])
-    whole = _whole_sums(stage, 0, sum(_gain(pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts))
+    units = sum(_gain(pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts)
+    way = moved_by_gears(group, pred) @ _share_of_gears(pred, channel, 3)
+    whole = _whole_sums(stage, 0, units + way[..., None] * X[:, :1, None].real)
     for name in ("own", "residual", "columns"):
         a, b = getattr(quick, name), getattr(whole, name)
         assert np.abs(a - b).max() < 1e-10 * np.abs(b).max()
+
+
+@pytest.mark.parametrize("channel, value", [("spring", 1e-4), ("link", 1.0), ("position", 1e-4)])
+def test_a_unit_response_holds_what_the_arm_does_where_it_comes_to_stand(identified, named, channel, value):
+    """A gear that always carries its load one way stands elsewhere by half of its dead band, and there the arm is another.
+
+    So it does under a constant torque on its link, and where its encoder is off by a constant angle.
+    """
+    _, setup, result = identified
+    problem, h = setup.problem, named["backlash", "elbow_joint"]
+    if channel != "spring":
+        constant = torque_offset(h.joint, h.place)
+        h = replace(constant, channel=channel, law=lambda p, m, j, k: m.lines(constant.law(p, m, j, k)) if channel == "position" else constant.law(p, m, j, k))
+    preds = predictions(problem, result.model, result.remainders, steps=8)
+    moved = predictions(problem, replace(result.model, effects=(Effect(h, np.array([value])),)), result.remainders, steps=8)
+    for group, a, b in zip(problem.groups, preds, moved, strict=True):
+        delta = a.motion(group).delta(h.joint)
+        assert np.all(np.sign(delta) == np.sign(delta[0, 0]))  # the gear stays on one flank
+        X = value * _lines(a.motion(group), h.screen(a.motion(group), h.joint, a.par.stiffness[h.joint], ()).signals)[..., 0]
+        along = _gain(a, h.channel, h.joint) * X[..., None]
+        way = moved_by_gears(group, a) @ _share_of_gears(a, h.channel, h.joint) * X[:, :1, None].real
+        held, whole = (np.linalg.norm((x - b.outputs(group) + a.outputs(group))[:, 1 : group.n_compared]) for x in (along, along + way))
+        assert whole < 0.1 * held
 
 
 def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):

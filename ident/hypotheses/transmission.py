@@ -41,6 +41,11 @@ def backlash(joint: int, place: str) -> Hypothesis:
     """Dead band of width ``gap`` in the gear's deflection."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        if not shape:
+            # A gear that always carries its load one way is through its dead band, however wide: the arm stands elsewhere.
+            delta = motion.delta(j)
+            carried = -0.5 * k * np.sign(delta).mean(axis=1, keepdims=True)
+            return Screen((carried + 0.0 * delta,), lambda c: np.array([c[0]]) if c[0] > 0.0 else None, shape)
         signal = -k * np.clip(motion.delta(j), -0.5 * shape[0], 0.5 * shape[0])
         return Screen(
             (signal,), lambda c: np.array([shape[0] * np.clip(c[0], 0.3, 3.0)]) if c[0] > 0.1 else None, shape
@@ -53,7 +58,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
         "spring",
         (Parameter("gap", "rad", 1e-9, 0.5, log=True, step=1e-2),),
         lambda p, delta, k: kernels.Law(kernels.BACKLASH, p[0], 0.0, k),
-        lambda scale: [(2 * f * scale.delta[2],) for f in (0.03, 0.1, 0.3, 1.0)],
+        lambda scale: [(), *((2 * f * scale.delta[2],) for f in (0.03, 0.1, 0.3, 1.0))],
         screen,
         "The gear of {joint} has a dead band of {gap:.3g} rad: its resonance drops at small amplitude wherever"
         " gravity does not preload it.",
