@@ -19,6 +19,8 @@ from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, impl
 from ident.evidence import (
     ABSENT,
     LAW_ERROR,
+    TEMPER,
+    TEMPER_OF_NOISE,
     WAVE,
     Candidate,
     explained,
@@ -170,13 +172,23 @@ def attribute(
         rounds = renamed(rounds, effects, current.model.effects)
         taken = {e.hypothesis.key for e in (*effects, *current.model.effects)}
         current = pruned(problem, current)
+        if len(rounds) > 1:
+            # What is sought next would make up for a cause that was named wrongly as long as this one was missing.
+            before = current
+            current, earlier = rematched(problem, current, rounds[:-1], workers)
+            rounds = [*earlier, rounds[-1]]
+            current = current if current is before else pruned(problem, current)
+        taken |= {e.hypothesis.key for e in current.model.effects}
         # A special case of what is there already would only share its size with it.
         taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in current.model.effects}
         loaded = any(effect == "payload" for effect, _ in taken)
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
     if looped is not current and not workers.late:
         current = as_loops(problem, current, workers)
+    before = current
     current, rounds = rematched(problem, current, rounds, workers)
+    # Another cause may explain alone what its rival did together with a shadow of itself.
+    current = current if current is before else pruned(problem, current)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
@@ -249,7 +261,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     for c in sorted(ran, key=lambda c: c.fit.cost):
         best_of.setdefault(c.hypothesis.key, c)
     ran = list(best_of.values())
-    weighed = weigh(ran, model_error(min(c.fit.cost for c in ran), current.count, found.fall))
+    excess = model_error(min(c.fit.cost for c in ran), current.count, found.fall)
+    weighed = weigh(ran, excess, TEMPER_OF_NOISE if settled(found.before) else TEMPER)
     best = weighed[0]
     if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
         best = next(c for c in weighed if c.hypothesis is own.hypothesis)
@@ -523,7 +536,8 @@ def weighed_round(
     if not ranked:
         return Round(before, (), tuple(scores), 1.0, 0.0)
     rivals, excess = rivals_of_best(before, ranked)
-    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess)
+    temper = TEMPER_OF_NOISE if settled(before) else TEMPER
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess, temper)
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     noise = DETECTION_EXCESS if before.chi2_per_dof <= DETECTION_EXCESS else 1.0
     share = max(explained(before, weighed[0].fit, noise), softly.get(weighed[0].hypothesis.key, 0.0))

@@ -61,11 +61,13 @@ def conclude(
     late: Sequence[LinkDelay] = (),
     separating: NextExperiment | None = None,
     rigid: RigidFit | None = None,
+    belied: Collection[tuple[str, str]] = (),
 ) -> Verdict:
     """Put the result into the words and numbers of verdict.json.
 
     Args:
         baseline: the first model, and ``first`` what it predicts.
+        belied: causes, by ``key``, that held-out data deny (``trust.denied``).
         rigid: inertias of the links where they were found too: ``result`` is then about the model with them.
     """
     final = result.final
@@ -75,6 +77,7 @@ def conclude(
         refuted
         or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)
         or final.chi2_per_dof > LEFT_ERROR
+        or bool(belied)
         or not named_effects(final)
     )
     causes = []
@@ -86,7 +89,7 @@ def conclude(
         trust = known_probability(left_of(effect.hypothesis, result), doubted)
         trust *= explained_share(found, final)
         doubtful = pointless(effect) or too_fast(problem, last, effect) or shadowed(found, result.rounds)
-        if doubtful or not shown(effect, final, covariance):
+        if doubtful or effect.hypothesis.key in belied or not shown(effect, final, covariance):
             trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
     linear = linear_names(dataset.robot)
@@ -124,6 +127,7 @@ def conclude(
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
             *faint_note(result),
+            *(belied_note(e) for e in named_effects(final) if e.hypothesis.key in belied),
             *(nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy),
             *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
         ),
@@ -186,6 +190,15 @@ def faint_note(result: Attribution) -> tuple[str, ...]:
     return (
         f"The model leaves {result.baseline.chi2_per_dof:.3g} times the power of the noise that was estimated: more than chance"
         f" (p = {result.p_value:.1g}), but up to {DETECTION_EXCESS:g} times may be an error of that estimate.",
+    )
+
+
+def belied_note(effect: Effect) -> str:
+    """Why a cause is not trusted that held-out data deny, in a sentence."""
+    h = effect.hypothesis
+    return (
+        f"What {h.effect.replace('_', ' ')} at {h.place} changes within the noise of the data that it was found in does not show in"
+        " those that are held out: something else may be there."
     )
 
 

@@ -37,7 +37,7 @@ from ident.rigid import RigidFit, fit_rigid
 from ident.search import NOT_COMPUTED
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, Problem, data_count, fit, predictions
-from ident.trust import LEFT_ERROR, known_probability
+from ident.trust import LEFT_ERROR, denied, known_probability
 from ident.units import torque_unit
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 from robot_assets.errors import DataError
@@ -267,7 +267,8 @@ def diagnose_fully(
     last = predictions(problem, result.final.model, result.final.remainders)
     late = find_link_delays(recorded, last, problem.sampling.sample_time)
     separating = separating_experiment(problem, result)
-    verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid)
+    belied = {r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)}
+    verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied)
     if setup.ran_away:
         names = ", ".join(setup.ran_away)
         notes.append(f"Not among the held-out data: {names}. Torques above {RUNAWAY:g} times those of the others say that the loop was lost.")

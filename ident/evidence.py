@@ -16,6 +16,7 @@ from ident.torque_fit import Fit, inverse
 ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent
 ABSENT_LEVEL = 2.7e-3  # the same of several together, as a probability
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
+TEMPER_OF_NOISE = 1.5  # the same where the model without any of them leaves noise alone, which is known by the scatter of a few periods
 MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
 STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
 LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave
@@ -85,20 +86,21 @@ def model_error(left: float, count: float, fall: float) -> float:
     return above + (min(within, LAW_ERROR * fall) if fall > 0.0 else within)
 
 
-def weigh(candidates: Sequence[Candidate], excess: float) -> list[Candidate]:
+def weigh(candidates: Sequence[Candidate], excess: float, temper: float = TEMPER) -> list[Candidate]:
     """Probabilities of refitted hypotheses, best first.
 
     Under pure noise the evidence is half the difference of the costs. What the best model leaves
     above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
-    difference counts only against ``TEMPER + MODEL_ERROR_SHARE x excess``. Parameters count by how far
+    difference counts only against ``temper + MODEL_ERROR_SHARE x excess``. Parameters count by how far
     the data narrow them down (``occam``).
 
     Args:
         excess: cost beyond noise that the best of them leaves.
+        temper: what differences are divided by without that.
     """
     cost = np.array([c.fit.cost for c in candidates])
     decoy = np.array([c.hypothesis.decoy for c in candidates], float)
-    temper = TEMPER + MODEL_ERROR_SHARE / 6.0 * excess
+    temper = temper + MODEL_ERROR_SHARE / 6.0 * excess
     evidence = -0.5 * (cost - cost.min()) / temper - DECOY_NATS * decoy
     evidence += [occam(c, temper) + c.hypothesis.options.get("nats", 0.0) for c in candidates]
     evidence -= evidence.max()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
 from ident.faint import SHADOW
 from ident.hypotheses import Hypothesis
-from ident.torque_fit import Fit, Problem
+from ident.records import Group
+from ident.search import NOT_COMPUTED, settled
+from ident.torque_fit import Fit, Problem, data_counts, make_weights, predictions, weighted_cost
 from ident.verdict import Gain
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
@@ -27,6 +30,8 @@ FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band 
 SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
 HARMONIC = 0.1  # the same of a ripple at a multiple of the periods of another one
 HALF_TRUSTED = 0.1  # share of the discrepancy left, a third of its amplitude, at which a name is as likely wrong as right
+DENIED_SHARE = 0.25  # of the fall of the cost that a faint cause foretells on held-out data, below which it does not come
+CHANCE = 3.0  # standard deviations of that fall, within which it may be short by chance
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 
@@ -76,6 +81,33 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
     settled = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
     expected = 1.0 - np.sqrt(left)
     return gain.gap_closed < max(CARRIED if settled else CLOSED, expected - SHORT)
+
+
+def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
+    """Whether held-out periodic data deny a cause that was named for less than the noise as a whole shows.
+
+    Two laws of as many parameters as postures describe what a third one leaves at these. In another posture a law that is
+    right lowers the cost by what it changes there in units of the noise, ``E``, with a standard deviation of ``2 sqrt(E)``;
+    one that is wrong need not. Where it changes little these data say nothing.
+
+    Args:
+        groups: held-out data.
+    """
+    periodic = tuple(g for g in groups if g.window is None and g.U_periods.shape[1] > 1)
+    winner = found.candidates[0]
+    if winner.hypothesis.decoy or not periodic or not settled(found.before):
+        return False
+    there = replace(problem, groups=periodic)
+    try:
+        before, after = (predictions(there, fit.model, [None] * len(periodic), None) for fit in (found.before, winner.fit))
+        weights = make_weights(there, after, 0.0)
+    except NOT_COMPUTED:
+        return False
+    noise = max(1.0, weighted_cost(there, after, weights) / float(np.sum(data_counts(there))))
+    changes = (g.observe_outputs(b.outputs(g) - a.outputs(g)) for g, a, b in zip(periodic, before, after, strict=True))
+    foretold = sum(float(np.sum(np.abs(weights.apply(i, x)) ** 2)) for i, x in enumerate(changes)) / noise
+    fall = (weighted_cost(there, before, weights) - weighted_cost(there, after, weights)) / noise
+    return fall < min(DENIED_SHARE * foretold, foretold - CHANCE * 2.0 * np.sqrt(foretold))
 
 
 def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:

@@ -71,7 +71,7 @@ from ident.torque_fit import (
     weighted_cost,
 )
 from ident.trust import shadowed, shown
-from ident.verdict import Gain
+from ident.verdict import UNKNOWN, Gain
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
@@ -530,6 +530,10 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
         (cause,) = conclude(data, problem, (), worse, heard, None, preds, preds).causes
         given.append(cause.probability)
     assert given[0] > 0.9 and given[1] < 0.5
+    monkeypatch.setattr("ident.conclude.shown", lambda *args: True)
+    verdict = conclude(data, problem, (), worse, heard, None, preds, preds, belied={h.key})
+    assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
+    assert any("hysteresis at elbow_joint" in note and "held out" in note for note in verdict.notes)
 
 
 @pytest.mark.parametrize(("std", "trusted"), [(0.02, True), (1.5, False)])

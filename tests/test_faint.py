@@ -9,11 +9,12 @@ import pytest
 from ident.attribute import LEFT_TO_DECOYS, Round, attribute, told_share
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.diagnose import diagnose, explained
-from ident.evidence import LAW_ERROR, TEMPER, Candidate, model_error, weigh
+from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
 from ident.extended import Effect, along_record
 from ident.faint import ALONG, LINEAR, SEEN, SHADOW, faint_scores, hidden, seen
 from ident.hypotheses import catalogue
 from ident.search import hopeful
+from ident.trust import denied
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
 from tests.conftest import small_plan, through_files
@@ -147,6 +148,36 @@ def test_faint_candidates_are_told_apart_by_what_they_explain(hypotheses):
     assert of_all < 0.95
 
 
+def test_beside_noise_alone_differences_count_for_more(hypotheses):
+    """No law has an error there that neighbouring lines could share."""
+    h = next(h for h in hypotheses if h.effect == "torque_delay")
+    model = SimpleNamespace(effects=(SimpleNamespace(hypothesis=h, p=np.array([1e-4])),), par=SimpleNamespace(stiffness=np.ones(6)))
+    two = [Candidate(h, SimpleNamespace(model=model, information=np.eye(4), cost=cost), 0.0) for cost in (1000.0, 1012.0)]
+    for temper in (TEMPER, TEMPER_OF_NOISE):
+        assert weigh(two, 0.0, temper)[0].probability == pytest.approx(1.0 / (1.0 + np.exp(-6.0 / temper)), abs=1e-9)
+
+
+@pytest.mark.parametrize(("wrong", "right", "expected"), [
+    (3e-3, 0.0, True),  # held-out data do not show what it foretells
+    (0.0, 3e-3, False),  # they do
+    (1e-6, 0.0, False),  # nothing that they could show
+])  # fmt: skip
+def test_held_out_data_deny_a_faint_cause_that_does_not_show_there(identified, hypotheses, wrong, right, expected):
+    """Only of a cause that was found within the noise, and by periodic data."""
+    _, setup, baseline = identified
+    h = next(h for h in hypotheses if h.key == ("encoder_eccentricity", "elbow_joint"))
+    before, after = (
+        replace(baseline, model=replace(baseline.model, effects=(Effect(h, np.array([size, size])),) if size else ()))
+        for size in (right, wrong)
+    )
+    found = Round(before, (Candidate(h, after, 0.0, 1.0),), (), 1.0, 1.0)
+    assert any(g.window is None for g in setup.held_out)
+    assert denied(setup.problem, setup.held_out, found) == expected
+    motions = tuple(g for g in setup.held_out if g.window is not None)
+    assert not denied(setup.problem, motions, found)
+    assert not denied(setup.problem, setup.held_out, replace(found, before=replace(before, costs=10.0 * before.costs)))
+
+
 def test_the_special_case_of_a_law_that_goes_on_goes_on_too(hypotheses):
     """Coulomb friction is behind all laws that hold it, by what these have beyond it: noise, perhaps."""
     at = [h for h in hypotheses if h.place == "elbow_joint"]
@@ -181,6 +212,38 @@ def test_a_faint_round_asks_what_a_linear_step_puts_near_the_clearest(identified
     found = attribute(setup.problem, baseline)
     assert asked == [hypotheses[:2]]
     assert not found.detected and found.p_value == pytest.approx(discrepancy_p_value(baseline))
+
+
+def test_earlier_causes_are_weighed_again_before_more_is_sought(identified, hypotheses, monkeypatch):
+    """All but the one just found; and the model is pruned where another cause has taken the place of one of them."""
+    _, setup, baseline = identified
+    order, left = [], iter([h for h in hypotheses if h.effect == "torque_delay"][:3])
+    loud = replace(baseline, costs=100.0 * baseline.costs)
+
+    def once(problem, current, *rest):
+        h = next(left, None)
+        if h is None:
+            return Round(current, (), (), 1.0, 0.0)
+        model = replace(current.model, effects=(*current.model.effects, Effect(h, np.array([1e-4]))))
+        return Round(current, (Candidate(h, replace(current, model=model, costs=0.5 * current.costs), 0.0, 1.0),), (), 1.0, 1.0)
+
+    def rematched(problem, current, rounds, workers):
+        order.append([r.candidates[0].hypothesis.place for r in rounds])
+        return replace(current), list(rounds)
+
+    def pruned(problem, current):
+        order.append(len(current.model.effects))
+        return current
+
+    monkeypatch.setattr("ident.attribute.attribute_once", once)
+    monkeypatch.setattr("ident.attribute.polish", lambda problem, result: result)
+    monkeypatch.setattr("ident.attribute.plainer", lambda problem, current, *rest: current)
+    monkeypatch.setattr("ident.attribute.companions", lambda problem, current, *rest: (current, []))
+    monkeypatch.setattr("ident.attribute.rematched", rematched)
+    monkeypatch.setattr("ident.attribute.pruned", pruned)
+    attribute(setup.problem, loud)
+    a, b, c = setup.problem.structure.robot.joint_names[:3]
+    assert order == [1, 2, [a], 2, 3, [a, b], 3, [a, b, c], 3]
 
 
 def test_loops_are_tried_once_before_more_is_sought(identified, monkeypatch):
