@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.extended import Prediction
+from ident.graybox import linearise
 from ident.hypotheses import Hypothesis, SignalScale
-from ident.inverse import Motion, geometric_remainder
+from ident.inverse import Motion
 from ident.parallel import map_threads
 from ident.records import Group
 from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error
@@ -285,21 +286,22 @@ def moved_by_gears(group: Group, pred: Prediction) -> np.ndarray:
     """What a constant torque of 1 N m in a gear does to the outputs by the posture to which it moves the arm.
 
     A gear that gives a little under the weight of the arm hardly changes the torque that holds it up, and all that the arm
-    does elsewhere: its inertia there is another. By differences of the geometric remainder, the motion held.
+    does elsewhere: its inertia there is another. By differences of the arm linearised at rest.
 
     Returns:
         (S, L, n + M, joints) outputs per N m, beyond those of the linear arm.
     """
-    plane, solution = pred.plane, pred.solution
-    here = geometric_remainder(pred.structure, plane, group, solution.Q_a)
+    plane, here = pred.plane, pred.plane.lin
+    motion = pred.solution.Q_a.copy()
+    motion[:, 0] -= here.q
+    s = plane.s[:, None, None]
     out = []
     for column in pred.structure.driven:
         way = plane.A_inv[0, :, column].real
         step = MOVED / np.abs(way).max()
-        there = solution.Q_a.copy()
-        there[:, 0] += step * way
-        change = (geometric_remainder(pred.structure, plane, group, there) - here) / step
-        out.append(np.matmul(plane.output_per_load, change[..., None])[..., 0])
+        there = linearise(pred.structure, here.q + step * way)
+        change = (s**2 * (there.M - here.M) + (there.Kg - here.Kg)) / step
+        out.append(np.matmul(plane.output_per_load @ change, motion[..., None])[..., 0])
     return np.stack(out, axis=-1)
 
 
