@@ -42,7 +42,7 @@ def test_a_hidden_effect_is_found(ur10, tmp_path, name):
     assert verdict.gain.gap_closed > 0.85 and verdict.gain.after < verdict.gain.before
 
 
-@pytest.mark.parametrize(("power", "coefficient"), [(2.0, 60.0), (0.4, 8.0)])
+@pytest.mark.parametrize(("power", "coefficient"), [pytest.param(2.0, 60.0, marks=pytest.mark.slow), (0.4, 8.0)])
 def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path, power, coefficient):
     from dataclasses import dataclass
 

@@ -32,7 +32,7 @@ def hypotheses(identified):
 
 @pytest.mark.parametrize(("faint", "beside"), [
     (COGGING, ()),
-    (COULOMB, (DELAY,)),
+    pytest.param(COULOMB, (DELAY,), marks=pytest.mark.slow),
     pytest.param(COULOMB, (), marks=pytest.mark.slow),
     pytest.param(COGGING, (DELAY,), marks=pytest.mark.slow),
 ])  # fmt: skip
