@@ -36,7 +36,7 @@ from sizing import brought_to
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnose import diagnose_fully
-from ident.excitation import Plan, operating_points
+from ident.excitation import Experiment, Plan, operating_points
 from ident.parallel import open_executor
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, load_robot
@@ -82,7 +82,7 @@ class Case:
         does at rest is outside of the band: the torque that holds it up there would count for more than all its motion.
         """
         plan, robot = self.plan, self.plan.robot
-        shown = [e for e in plan.experiments if e.role == "identification" and e.experiment == 1]
+        shown = [e for e in shown_in(plan) if e.experiment == 1]
         some = tuple(e for e in shown if e.amplitude == max(x.amplitude for x in shown))
         small = replace(plan, experiments=some, trajectories=())
         lines = int(plan.excitation.lines.max()) + 1
@@ -140,7 +140,7 @@ def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: s
         levels=(1.0, 0.6, 0.3) if rng.random() < 0.5 else (1.0, 0.4),
         period=int(rng.choice([3000, 4000])),
     )
-    shown = [e for e in plan.experiments if e.role == "identification"]
+    shown = shown_in(plan)
     peak = np.max([np.abs(e.r).max(axis=0) for e in shown], axis=0)
     peak = peak + np.max([np.abs(gravity_torque(plant, e.q0)) for e in shown], axis=0)
     hidden, stronger = [], []
@@ -149,6 +149,11 @@ def draw_case(seed: int, names: tuple[str, ...] | None, kind: str, robot_name: s
         stronger.append(partial(_again, copy.deepcopy(rng), robot, name, peak, strength))
         hidden.append(_drawn(rng, robot, name, peak, strength))
     return Case(plan, hidden, stronger, draw_drives(rng, robot), float(rng.choice([2.5e-4, 2e-4])), seed)
+
+
+def shown_in(plan: Plan) -> list[Experiment]:
+    """Experiments of a plan that are not held out."""
+    return [e for e in plan.experiments if e.role == "identification"]
 
 
 def _drawn(rng: np.random.Generator, robot: Robot, name: str | None, peak: np.ndarray, strength: float) -> object:

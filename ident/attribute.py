@@ -174,10 +174,8 @@ def attribute(
         current = pruned(problem, current)
         if len(rounds) > 1:
             # What is sought next would make up for a cause that was named wrongly as long as this one was missing.
-            before = current
-            current, earlier = rematched(problem, current, rounds[:-1], workers)
+            current, earlier = weighed_again(problem, current, rounds[:-1], workers)
             rounds = [*earlier, rounds[-1]]
-            current = current if current is before else pruned(problem, current)
         taken |= {e.hypothesis.key for e in current.model.effects}
         # A special case of what is there already would only share its size with it.
         taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in current.model.effects}
@@ -185,10 +183,7 @@ def attribute(
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
     if looped is not current and not workers.late:
         current = as_loops(problem, current, workers)
-    before = current
-    current, rounds = rematched(problem, current, rounds, workers)
-    # Another cause may explain alone what its rival did together with a shadow of itself.
-    current = current if current is before else pruned(problem, current)
+    current, rounds = weighed_again(problem, current, rounds, workers)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
@@ -220,6 +215,14 @@ def outdone(found: Round) -> bool:
     """Whether a decoy does better than the cause that a round has named."""
     best = max(found.candidates, key=lambda c: c.probability)
     return best.hypothesis.decoy and best is not found.candidates[0]
+
+
+def weighed_again(
+    problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers
+) -> tuple[Fit, list[Round]]:
+    """``rematched``, and the model pruned where a rival has won: alone it may explain what the loser did beside others."""
+    found, rounds = rematched(problem, current, rounds, workers)
+    return found if found is current else pruned(problem, found), rounds
 
 
 def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> tuple[Fit, list[Round]]:
@@ -262,7 +265,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         best_of.setdefault(c.hypothesis.key, c)
     ran = list(best_of.values())
     excess = model_error(min(c.fit.cost for c in ran), current.count, found.fall)
-    weighed = weigh(ran, excess, TEMPER_OF_NOISE if settled(found.before) else TEMPER)
+    weighed = weigh(ran, excess, temper_of(found.before))
     best = weighed[0]
     if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
         best = next(c for c in weighed if c.hypothesis is own.hypothesis)
@@ -525,6 +528,11 @@ def beside_unclear(
     return weighed_round(before, ranked, scores, {})
 
 
+def temper_of(before: Fit) -> float:
+    """What differences of evidence are divided by, from the model without any of the candidates."""
+    return TEMPER_OF_NOISE if settled(before) else TEMPER
+
+
 def weighed_round(
     before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]], scores: Sequence[Score], softly: Mapping[tuple[str, str], float]
 ) -> Round:
@@ -536,8 +544,7 @@ def weighed_round(
     if not ranked:
         return Round(before, (), tuple(scores), 1.0, 0.0)
     rivals, excess = rivals_of_best(before, ranked)
-    temper = TEMPER_OF_NOISE if settled(before) else TEMPER
-    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess, temper)
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess, temper_of(before))
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     noise = DETECTION_EXCESS if before.chi2_per_dof <= DETECTION_EXCESS else 1.0
     share = max(explained(before, weighed[0].fit, noise), softly.get(weighed[0].hypothesis.key, 0.0))

@@ -17,7 +17,6 @@ from ident.graybox import linearise
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
 from ident.parallel import map_threads
-from ident.records import Group
 from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
@@ -119,7 +118,7 @@ class _Stage:
             J = fit.weights.apply(g, group.observe_outputs(jacobian(problem, fit.model, group, pred).dense()))
             moved = None
             if group.window is None:
-                moved = fit.weights.apply(g, group.observe_outputs(moved_by_gears(group, pred)))
+                moved = fit.weights.apply(g, group.observe_outputs(moved_by_gears(pred)))
                 sag = pred.par.stiffness * pred.solution.delta[:, 0].real
                 J[..., : problem.structure.n] += moved * sag[:, None, None, :]
             return fit.weights.apply(g, output_error(group, pred)), J, moved
@@ -282,7 +281,7 @@ def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:
     return np.broadcast_to(np.eye(outputs, dtype=complex)[joint], (lines, outputs))
 
 
-def moved_by_gears(group: Group, pred: Prediction) -> np.ndarray:
+def moved_by_gears(pred: Prediction) -> np.ndarray:
     """What a constant torque of 1 N m in a gear does to the outputs by the posture to which it moves the arm.
 
     A gear that gives a little under the weight of the arm hardly changes the torque that holds it up, and all that the arm

@@ -78,17 +78,17 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
         return True
     if gain.gap_closed is None or not gain.before > CLEAR * gain.noise_floor:
         return False
-    settled = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
+    lost = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
     expected = 1.0 - np.sqrt(left)
-    return gain.gap_closed < max(CARRIED if settled else CLOSED, expected - SHORT)
+    return gain.gap_closed < max(CARRIED if lost else CLOSED, expected - SHORT)
 
 
 def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
     """Whether held-out periodic data deny a cause that was named for less than the noise as a whole shows.
 
-    Two laws of as many parameters as postures describe what a third one leaves at these. In another posture a law that is
-    right lowers the cost by what it changes there in units of the noise, ``E``, with a standard deviation of ``2 sqrt(E)``;
-    one that is wrong need not. Where it changes little these data say nothing.
+    A law of as many parameters as there are postures describes in these whatever another cause leaves. In a further posture
+    a law that is right lowers the cost by what it changes there in units of the noise, ``E``, with a standard deviation of
+    ``2 sqrt(E)``; one that is wrong need not. Where it changes little these data say nothing.
 
     Args:
         groups: held-out data.

@@ -219,7 +219,7 @@ def test_signals_summed_line_by_line_are_those_of_whole_torques(identified, chan
     parts = [(channel, X), ("motor", M)]
     quick = _line_sums([(_Field.build(stage, 0, c, 3), x[:, : group.n_compared]) for c, x in parts])
     units = sum(_gain(pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts)
-    way = moved_by_gears(group, pred) @ _share_of_gears(pred, channel, 3)
+    way = moved_by_gears(pred) @ _share_of_gears(pred, channel, 3)
     whole = _whole_sums(stage, 0, units + way[..., None] * X[:, :1, None].real)
     for name in ("own", "residual", "columns"):
         a, b = getattr(quick, name), getattr(whole, name)
@@ -244,9 +244,39 @@ def test_a_unit_response_holds_what_the_arm_does_where_it_comes_to_stand(identif
         assert np.all(np.sign(delta) == np.sign(delta[0, 0]))  # the gear stays on one flank
         X = value * _lines(a.motion(group), h.screen(a.motion(group), h.joint, a.par.stiffness[h.joint], ()).signals)[..., 0]
         along = _gain(a, h.channel, h.joint) * X[..., None]
-        way = moved_by_gears(group, a) @ _share_of_gears(a, h.channel, h.joint) * X[:, :1, None].real
+        way = moved_by_gears(a) @ _share_of_gears(a, h.channel, h.joint) * X[:, :1, None].real
         held, whole = (np.linalg.norm((x - b.outputs(group) + a.outputs(group))[:, 1 : group.n_compared]) for x in (along, along + way))
         assert whole < 0.1 * held
+
+
+@pytest.mark.parametrize("j", [1, 2, 3])
+def test_a_softer_gear_lets_the_arm_sag_in_the_columns_of_the_drives(identified, j):
+    """What a hypothesis explains is what the drives cannot: they move the arm to another posture too."""
+    _, setup, result = identified
+    problem, step = setup.problem, 1e-3
+    softer = result.model.par.stiffness * (1.0 + step * (np.arange(6) == j))
+    models = result.model, replace(result.model, par=replace(result.model.par, stiffness=softer))
+    before, after = (predictions(problem, m, result.remainders, steps=8) for m in models)
+    stage = _Stage.build(problem, result, before)
+    for g, (group, a, b) in enumerate(zip(problem.groups, before, after, strict=True)):
+        exact = result.weights.apply(g, group.observe_outputs(b.outputs(group) - a.outputs(group))) / np.log1p(step)
+        sag = stage.moved[g][..., j] * a.par.stiffness[j] * a.solution.delta[:, 0, j, None, None].real
+        lacking = exact - (stage.columns[g][..., j] - sag)
+        share = np.sum((sag.conj() * lacking)[:, 1:]).real / np.sum(np.abs(sag[:, 1:]) ** 2)
+        assert share == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_dead_band_is_screened_where_gravity_has_led_the_gear_through_it(identified, named):
+    """It changes nothing but the posture of the arm, by half of its width."""
+    _, setup, result = identified
+    problem, gap, h = setup.problem, 1e-3, named["backlash", "elbow_joint"]
+    models = result.model, replace(result.model, effects=(Effect(h, np.array([gap])),))
+    before, after = (predictions(problem, m, result.remainders, steps=8) for m in models)
+    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
+    problem = replace(problem, groups=tuple(changed))
+    bands = [x for x in named.values() if x.effect == "backlash"]
+    first, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), bands)
+    assert first.hypothesis is h and first.start == pytest.approx([gap], rel=0.1)
 
 
 def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):

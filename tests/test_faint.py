@@ -6,15 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.attribute import LEFT_TO_DECOYS, Round, attribute, told_share
+from ident.attribute import LEFT_TO_DECOYS, Attribution, Round, attribute, temper_of, told_share, weighed_round
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.diagnose import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
 from ident.extended import Effect, along_record
 from ident.faint import ALONG, LINEAR, SEEN, SHADOW, faint_scores, hidden, seen
 from ident.hypotheses import catalogue
-from ident.search import hopeful
+from ident.search import hopeful, refit
 from ident.trust import denied
+from ident.verdict import UNKNOWN
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
 from tests.conftest import small_plan, through_files
@@ -155,6 +156,43 @@ def test_beside_noise_alone_differences_count_for_more(hypotheses):
     two = [Candidate(h, SimpleNamespace(model=model, information=np.eye(4), cost=cost), 0.0) for cost in (1000.0, 1012.0)]
     for temper in (TEMPER, TEMPER_OF_NOISE):
         assert weigh(two, 0.0, temper)[0].probability == pytest.approx(1.0 / (1.0 + np.exp(-6.0 / temper)), abs=1e-9)
+
+
+def test_a_round_within_the_noise_is_weighed_so(identified, hypotheses):
+    """By what the model without a new cause leaves, in the round and when its causes meet again."""
+    *_, baseline = identified
+    (h, other) = [h for h in hypotheses if h.effect == "torque_delay"][:2]
+    quiet, loud = (replace(baseline, costs=x * baseline.counts) for x in (0.9, 1.2))
+    assert (temper_of(quiet), temper_of(loud)) == (TEMPER_OF_NOISE, TEMPER)
+
+    def fitted(h, cost: float):
+        model = replace(baseline.model, effects=(Effect(h, np.array([1e-4])),))
+        return replace(baseline, model=model, costs=quiet.costs - cost / 6.0, information=np.eye(len(baseline.information) + 1))
+
+    ranked = [(h, fitted(h, 212.0)), (other, fitted(other, 200.0))]
+    for before, temper in ((quiet, TEMPER_OF_NOISE), (loud, TEMPER)):
+        found = weighed_round(before, ranked, (), {})
+        assert found.candidates[0].probability == pytest.approx(1.0 / (1.0 + np.exp(-6.0 / temper)), rel=1e-3)
+
+
+def test_a_diagnosis_asks_held_out_data_about_its_causes(clean, identified, hypotheses, monkeypatch):
+    _, setup, baseline = identified
+    h = next(h for h in hypotheses if h.key == ("torque_delay", "elbow_joint"))
+    model = replace(baseline.model, effects=(Effect(h, np.array([1e-3])),))
+    final = refit(setup.problem, model, baseline.weights, baseline.remainders)
+    found = Round(baseline, (Candidate(h, final, 0.0, 1.0),), (), 1.0, 1.0)
+    asked = []
+
+    def deny(problem, groups, of):
+        asked.append((groups, of))
+        return True
+
+    monkeypatch.setattr("ident.diagnose.identify", lambda *args, **rest: (setup, baseline))
+    monkeypatch.setattr("ident.diagnose.attribute", lambda *args, **rest: Attribution(baseline, True, 0.0, (found,), final, False))
+    monkeypatch.setattr("ident.diagnose.denied", deny)
+    verdict = diagnose(clean[0])
+    assert asked == [(setup.held_out, found)]
+    assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
 
 
 @pytest.mark.parametrize(("wrong", "right", "expected"), [

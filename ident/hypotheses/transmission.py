@@ -45,7 +45,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
             # A gear that always carries its load one way is through its dead band, however wide: the arm stands elsewhere.
             delta = motion.delta(j)
             carried = -0.5 * k * np.sign(delta).mean(axis=1, keepdims=True)
-            return Screen((carried + 0.0 * delta,), lambda c: np.array([c[0]]) if c[0] > 0.0 else None, shape)
+            return Screen((np.broadcast_to(carried, delta.shape),), lambda c: np.array([c[0]]) if c[0] > 0.0 else None, shape)
         signal = -k * np.clip(motion.delta(j), -0.5 * shape[0], 0.5 * shape[0])
         return Screen(
             (signal,), lambda c: np.array([shape[0] * np.clip(c[0], 0.3, 3.0)]) if c[0] > 0.1 else None, shape
