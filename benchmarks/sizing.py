@@ -12,14 +12,15 @@ E = TypeVar("E")
 TRIALS = 12  # sizes found out, at most
 NEAR = 0.1  # logarithm of the ratio to the target within which an effect is there
 LONGEST = 4.0  # step of log strength
+EDGE = 0.1  # share of the way between too little and too much, at either end, where no secant is followed
 SLOPES = 0.3, 3.0  # of log size over log strength that a step believes
 
 
 def brought_to(stronger: Callable[[float], E], size: Callable[[E], float], target: float) -> E:
     """The effect of a size, by secants of the logarithm of size over that of strength; the nearest where none is found.
 
-    Between a strength that does too little and one that does too much, whose secant leads out of there or which do
-    nothing and all at once, as a limit does that the torque just reaches, in halves.
+    Between a strength that does too little and one that does too much in halves, where the secant leads out of there or to
+    an end: such effects do nothing and all at once, as a limit does that the torque just reaches.
 
     Args:
         stronger: the effect with its strength times a factor.
@@ -39,6 +40,7 @@ def brought_to(stronger: Callable[[float], E], size: Callable[[E], float], targe
             (a, u, _), (b, v, _) = found[-2:]
             slope = float(np.clip((v - u) / (b - a), *SLOPES))
         step -= float(np.clip(off / slope, -LONGEST, LONGEST))
-        if not low < step < high:
+        margin = EDGE * (high - low) if np.isfinite(high - low) else 0.0
+        if not low + margin < step < high - margin:
             step = 0.5 * (low + high)
     return min(found, key=lambda x: abs(x[1]))[2]

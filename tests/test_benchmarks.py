@@ -1,7 +1,7 @@
 """The blind benchmark hides effects of the sizes that it says."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from benchmarks.sizing import NEAR, TRIALS, brought_to
@@ -35,6 +35,7 @@ def test_the_nearest_of_an_effect_that_does_not_come_there():
 
 
 @given(limit=st.floats(-3.0, 3.0), target=st.floats(3.0, 100.0))
+@example(limit=1.65625, target=30.5)  # secants that lead from one end to the other and back
 def test_an_effect_that_does_nothing_up_to_a_strength_and_soon_too_much(limit, target):
     """As a torque limit, beyond which the arm falls: it is sought between."""
 
