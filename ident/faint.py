@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.stats
 
+from ident.baseline import DETECTION_EXCESS
 from ident.extended import is_along_record
 from ident.hypotheses import Hypothesis
 from ident.screening import Score, screen
@@ -57,9 +58,29 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
         return []
     along = {e.hypothesis.joint for e in current.model.effects if is_along_record(e.hypothesis)}
     hypotheses = [h for h in hypotheses if h.on_chain or h.joint not in along]
-    at_joints = SHADOW * np.maximum(told, 0.0)
+    at_joints = left_by_laws(current, told)
     scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
     return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]
+
+
+def left_by_laws(current: Fit, told: np.ndarray) -> np.ndarray:
+    """Cost by joint (n,) that errors of the laws of causes already found may leave, in proportion to what causes explain there.
+
+    Such errors show at the joint of their cause first. Elsewhere they leave no larger share than there, as far as the noise
+    there is known; a change of the chain has no such joint.
+
+    Args:
+        told: (n,) fall of the cost by joint that causes have brought.
+    """
+    told = np.maximum(told, 0.0)
+    causes = [e.hypothesis for e in current.model.effects]
+    own = sorted({h.joint for h in causes})
+    share = np.full(len(told), SHADOW)
+    if own and not any(h.on_chain for h in causes):
+        above = np.maximum(current.costs - current.counts, 0.0) + (DETECTION_EXCESS - 1.0) * current.counts
+        seen_there = max(float(above[j] / max(told[j], 1e-300)) for j in own)
+        share[np.setdiff1d(np.arange(len(told)), own)] = min(SHADOW, seen_there)
+    return share * told
 
 
 def seen(scores: Sequence[Score], current: Fit) -> Score | None:

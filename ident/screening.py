@@ -46,7 +46,7 @@ def signal_scale(
 ) -> SignalScale:
     """Sizes of a joint's signals over all records."""
     v, q, delta, torque, res, peak = [], [], [], [], [], []
-    starts, resonances = [], []
+    starts, tops = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
         motion = pred.motion(group)
         v.append(np.mean(motion.v(joint) ** 2))
@@ -59,9 +59,8 @@ def signal_scale(
         r = group.to_time((group.U - pred.U)[..., joint : joint + 1])
         res.append(np.mean(r**2))
         starts += [*group.start, *(group.start + group.period_time)]
-        resonances.append(group.omega[group.n_compared - 1] / 2 / np.pi)
+        tops.append(group.omega[group.n_compared - 1] / 2 / np.pi)
     all_delta = np.concatenate(delta)
-    top = float(np.median(resonances))
     return SignalScale(
         v=float(np.sqrt(np.mean(v))),
         q=float(np.sqrt(np.mean(q))),
@@ -73,7 +72,7 @@ def signal_scale(
         wave_numbers=wave_numbers,
         peak_torque=float(max(peak)),
         duration=float(max(starts) - min(starts)) if len(set(np.round(starts, 3))) > 2 else 0.0,
-        resonances=tuple(top * f for f in (0.06, 0.12, 0.22, 0.35, 0.55, 0.85)),
+        highest_line=float(np.median(tops)),
     )
 
 

@@ -52,7 +52,7 @@ POLISH_STEPS = 40  # of the winner of a round
 PER_EFFECT = 2  # of one effect, at most
 NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
 NEAR_BODY = 1.0 / 3.0  # the same of a body's inertia, where one answers best
-MID_RESONANCE, MID_RATIO = 0.5, 0.05  # of a hinge that screening does not place: share of the highest resonance tried, damping
+MID_RESONANCE, MID_RATIO = 0.425, 0.05  # of a hinge that screening does not place: over the highest line, damping
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
@@ -352,7 +352,7 @@ def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Seq
     The gears have taken up the best part of one that is missing: a linear step from there has a wrong sign, or
     answers at another joint.
     """
-    middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).resonances[-1]
+    middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).highest_line
     hinges = [s for s in scores if "hinge" in s.hypothesis.options]
     return [replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO)) for s in hinges]
 

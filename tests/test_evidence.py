@@ -29,6 +29,7 @@ from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
+from ident.hypotheses.structure import hinge_inertia
 from ident.parallel import Workers
 from ident.reporting import frf_views
 from ident.screening import (
@@ -277,6 +278,24 @@ def test_a_dead_band_is_screened_where_gravity_has_led_the_gear_through_it(ident
     bands = [x for x in named.values() if x.effect == "backlash"]
     first, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), bands)
     assert first.hypothesis is h and first.start == pytest.approx([gap], rel=0.1)
+
+
+def test_a_hinge_far_above_the_band_is_screened_where_it_is(identified):
+    """It gives in proportion to its torque: no resonance of it is seen, and none within the band answers so."""
+    _, setup, result = identified
+    problem, stiffness = setup.problem, 5e7
+    hinges = [h for h in catalogue(problem.structure) if "hinge" in h.options]
+    base = next(h for h in hinges if h.effect == "base_elasticity")
+    group, tilts = problem.groups[0], np.zeros(len(base.parameters) - 2)
+    own = hinge_inertia(problem.structure, base.options["change"]([stiffness, 1.0, *tilts]).elasticities[0], group)
+    assert np.sqrt(stiffness / own) > 1.5 * group.omega[group.n_compared - 1]
+    models = result.model, replace(result.model, effects=(Effect(base, np.array([stiffness, 100.0, *tilts])),))
+    before, after = (predictions(problem, m, result.remainders) for m in models)
+    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
+    problem = replace(problem, groups=tuple(changed))
+    first, second, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), hinges)
+    assert first.hypothesis is base and first.gain > 1.2 * second.gain
+    assert first.start[0] == pytest.approx(stiffness, rel=0.3)
 
 
 def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):

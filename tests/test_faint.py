@@ -11,7 +11,7 @@ from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.diagnose import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
 from ident.extended import Effect, along_record
-from ident.faint import ALONG, LINEAR, SEEN, SHADOW, faint_scores, hidden, seen
+from ident.faint import ALONG, LINEAR, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
 from ident.hypotheses import catalogue
 from ident.search import hopeful, refit
 from ident.trust import denied
@@ -74,6 +74,24 @@ def test_what_laws_already_found_may_leave_is_not_looked_at(identified, hypothes
         return {-1 if s.hypothesis.on_chain else s.hypothesis.joint for s in scores if s.gain <= 5.0}
 
     assert small(every) == {-1, *range(6)} and small(left) == set(range(6)) - {joint}
+
+
+@pytest.mark.parametrize(("effect", "place", "left", "share"), [
+    ("sensor_delay", "wrist_1_joint", 1.0, 1e-4),  # noise at its own joint: its law has no error that others could show
+    ("sensor_delay", "wrist_1_joint", 1.3, 4e-4),
+    ("sensor_delay", "wrist_1_joint", 5.0, SHADOW),
+    ("payload", "flange", 1.0, SHADOW),  # a change of the chain has no joint of its own
+])  # fmt: skip
+def test_errors_of_a_law_show_at_its_own_joint_first(identified, hypotheses, effect, place, left, share):
+    *_, baseline = identified
+    h = next(h for h in hypotheses if h.key == (effect, place))
+    costs = baseline.counts * np.where(np.arange(6) == h.joint, left, 1.0)
+    model = replace(baseline.model, effects=(Effect(h, np.ones(len(h.parameters))),))
+    told = np.full(6, 1e3 * baseline.counts[h.joint])
+    allowed = left_by_laws(replace(baseline, model=model, costs=costs), told) / told
+    assert allowed[h.joint] == SHADOW
+    assert np.delete(allowed, h.joint) == pytest.approx(share)
+    assert left_by_laws(replace(baseline, costs=costs), told) == pytest.approx(SHADOW * told)
 
 
 def test_a_noisier_joint_shows_less(identified, hypotheses):

@@ -170,7 +170,8 @@ class SignalScale:
     Attributes:
         v: rms velocity, rad/s; q: rms excursion, rad; delta: quantiles of |deflection| at
         10, 50, 90, 99.5 %; delta_rms: rad; torque: rms dynamic torque, N m; residual: rms residual torque, N m;
-        stiffness: N m/rad; wave_numbers: candidate periodicities in motor angle, 1/rad.
+        stiffness: N m/rad; wave_numbers: candidate periodicities in motor angle, 1/rad;
+        highest_line: that is compared, Hz.
     """
 
     v: float
@@ -182,5 +183,5 @@ class SignalScale:
     stiffness: float
     peak_torque: float
     duration: float
-    resonances: tuple[float, ...]
+    highest_line: float
     wave_numbers: tuple[float, ...]

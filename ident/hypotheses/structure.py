@@ -38,6 +38,7 @@ from robot_assets.robot import Elasticity
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
 SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
 STIFFEST = 1e12  # N m/rad, of a hinge
+RESONANCES = 0.06, 0.12, 0.22, 0.35, 0.55, 0.85, 5.0  # of a hinge, over the highest line: far above it all answer alike
 FARTHEST_REST = 10.0  # of a balancing spring, rad or m
 MOST_TILT = 3.0  # of an elastic axis towards each other axis, in units of that along the one from which it is sought
 YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
@@ -373,7 +374,7 @@ def compliance(
             *(Parameter(t, "1", -MOST_TILT, MOST_TILT, nuisance=True, step=1e-3, spread=1.0, null=0.0) for t in tilts),
         ),
         None,
-        lambda scale: [(f, 0.03) for f in scale.resonances],
+        lambda scale: [(f * scale.highest_line, 0.03) for f in RESONANCES],
         None,
         f"The data hold a resonance that the model lacks: {{joint}} bends across its axis, {where}, with"
         " {stiffness:.3g} N m/rad."
