@@ -20,18 +20,17 @@ import json
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-import scipy.fft
 from blind_summary import pictures, table
 from outside import draw_outside
 from provenance import commit
-from sizing import brought_to
+from sizing import brought_to, distortion, noise_power, spectra
 
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
@@ -48,6 +47,7 @@ from sim.plant import build_plant, gravity_torque
 ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "hardening_stiffness", "payload")
 ARMS = ("ur10", "irb", "panda")
 KINDS = {"none": 0.15, "one": 0.5, "two": 0.2, "outside": 0.15}
+STEP = 0.01  # of the logarithm of a figure of the drives, to see what it does
 COUNTS = {"none": 0, "one": 1, "two": 2, "outside": 0}
 CASES = {"smoke": 6, "quick": 26, "sixty": 60, "full": 400}
 
@@ -77,35 +77,34 @@ class Case:
     def sizer(self) -> Callable[[object], float]:
         """Distortion over noise of an effect: what it alone changes at the joint and posture (none held out) that show it most.
 
-        Root mean square over the excited band of the change of torque and position lines, over the noise of
-        these lines, in the first experiment at the largest level; the plant is simulated without noise. What the arm
-        does at rest is outside of the band: the torque that holds it up there would count for more than all its motion.
+        Root mean square over the excited band of what changes in torque and position lines and no change of the drives would
+        make, over the noise of these lines, in the first experiment at the largest level; the plant is simulated without noise.
         """
         plan, robot = self.plan, self.plan.robot
         shown = [e for e in shown_in(plan) if e.experiment == 1]
         some = tuple(e for e in shown if e.amplitude == max(x.amplitude for x in shown))
         small = replace(plan, experiments=some, trajectories=())
-        lines = int(plan.excitation.lines.max()) + 1
+        one = replace(small, excitation=replace(plan.excitation, periods=plan.excitation.transient_periods + 1))
+        lines = int(plan.excitation.lines.max())
 
-        def quiet(effects: list) -> tuple[Segment, ...]:
-            return run_experiment(
-                small, effects, seed=self.seed, drives=self.drives, timestep=self.timestep, noise=0.0
-            ).segments
+        def run(plan: Plan, effects: Sequence = (), drives: dict | None = None, noise: float = 0.0) -> tuple[Segment, ...]:
+            drives = self.drives if drives is None else drives
+            return run_experiment(plan, effects, seed=self.seed, drives=drives, timestep=self.timestep, noise=noise).segments
 
-        plain = quiet([])
+        plain, short = spectra(run(small), lines), spectra(run(one), lines)
+        noise = noise_power(run(small, noise=1.0), lines)
+        others = [
+            {**self.drives, name: values * np.exp(STEP * (np.arange(robot.n) == j))}
+            for name, values in self.drives.items()
+            for j in range(robot.n)
+        ]
+        ways = np.stack([spectra(run(one, drives=drives), lines) - short for drives in others])
 
         def size(effect: object) -> float:
-            power = np.zeros((len(some), robot.n))
             try:
-                moved = quiet([effect])
+                return distortion(spectra(run(small, [effect]), lines) - plain, ways, noise)
             except DataError:  # the loop is lost
                 return float("inf")
-            for s, (a, b) in enumerate(zip(plain, moved, strict=True)):
-                for channel, std in (("tau", robot.array("tau_std")), ("q", robot.array("q_std"))):
-                    change = scipy.fft.rfft((b.periodic(channel) - a.periodic(channel)).mean(axis=0), axis=0, norm="forward")
-                    noise = std**2 / (a.period * a.steady_periods)
-                    power[s] += np.mean(np.abs(change[1:lines]) ** 2, axis=0) / noise / 2
-            return float(np.sqrt(power.max()))
 
         return cache(size)
 

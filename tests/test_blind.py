@@ -25,7 +25,7 @@ def hide(robot, name, seed, folder):
     rng = np.random.default_rng(seed)
     effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH.get(name, 2.0))
     data = run_experiment(
-        small_plan(robot, seed, levels=(1.0, 0.6, 0.3)), [effect], seed=seed, drives=draw_drives(rng, robot)
+        small_plan(robot, seed), [effect], seed=seed, drives=draw_drives(rng, robot)
     )
     return effect, through_files(data, folder)
 

@@ -10,7 +10,7 @@ from sim.experiment import draw_drives
 from tests.conftest import small_plan, through_files
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
 def test_a_late_link_encoder_is_named_and_no_other_cause(ur10, tmp_path, seed):
     rng = np.random.default_rng(seed)
     place, delay = str(rng.choice(ur10.joint_names)), float(rng.uniform(5e-4, 4e-3))
