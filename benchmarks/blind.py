@@ -236,8 +236,12 @@ def judge(row: dict) -> dict:
     return {"right": right, "any": bool(named & wanted), "named": sorted(named), "errors": errors}
 
 
-def run(cases: list[tuple], executor: Executor) -> list[dict]:
-    """All cases on any executor; sorted by seed, so that the order of completion does not matter."""
+def run(cases: list[tuple], executor: Executor, keep: Callable[[list[dict]], None]) -> list[dict]:
+    """All cases on any executor; sorted by seed, so that the order of completion does not matter.
+
+    Args:
+        keep: given all that have ended, whenever one has.
+    """
     futures = [executor.submit(run_case, *case) for case in cases]
     rows = []
     for future in as_completed(futures):
@@ -245,7 +249,9 @@ def run(cases: list[tuple], executor: Executor) -> list[dict]:
         row["judged"] = judge(row)
         rows.append(row)
         print(line(row), flush=True)
-    return sorted(rows, key=lambda r: r["seed"])
+        rows.sort(key=lambda r: r["seed"])
+        keep(rows)
+    return rows
 
 
 def line(row: dict) -> str:
@@ -278,21 +284,25 @@ def main() -> None:
     names = ISSUE_SIX if args.effects == "six" else tuple(filter(None, args.effects.split(","))) or None
     sizes = tuple(args.sizes) if args.sizes else None
     cases = [(args.seed + i, names, args.kind, args.robot, sizes) for i in range(args.cases or CASES[args.size])]
+    options = f"--kind {args.kind} --robot {args.robot} --seed {args.seed} --cases {len(cases)}"
+    if args.effects:
+        options += f" --effects {args.effects}"
+    if args.sizes:
+        options += f" --sizes {args.sizes[0]:g} {args.sizes[1]:g}"
+    head = f"python benchmarks/blind.py {options}, commit {commit()}"
+
+    def keep(rows: list[dict]) -> None:
+        if args.out:
+            args.out.parent.mkdir(parents=True, exist_ok=True)
+            args.out.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            short = "" if len(rows) == len(cases) else f"; the {len(rows)} cases that have ended"
+            lines = "\n".join(line(row) for row in rows)
+            args.out.with_suffix(".txt").write_text(f"{head}{short}\n{lines}\n{table(rows)}\n", encoding="utf-8")
+
     with open_executor(args.executor) as executor:
-        rows = run(cases, executor or ThreadPoolExecutor(1))
-    text = table(rows)
-    print(text)
+        rows = run(cases, executor or ThreadPoolExecutor(1), keep)
+    print(table(rows))
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-        options = f"--kind {args.kind} --robot {args.robot} --seed {args.seed} --cases {len(rows)}"
-        if args.effects:
-            options += f" --effects {args.effects}"
-        if args.sizes:
-            options += f" --sizes {args.sizes[0]:g} {args.sizes[1]:g}"
-        head = f"python benchmarks/blind.py {options}, commit {commit()}"
-        lines = "\n".join(line(row) for row in rows)
-        args.out.with_suffix(".txt").write_text(f"{head}\n{lines}\n{text}\n", encoding="utf-8")
         pictures(rows, args.out.with_suffix(".png"))
 
 
