@@ -20,7 +20,7 @@ from provenance import commit
 from ident.attribute import attribute
 from ident.baseline import UNDETERMINED
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnose import identify
+from ident.diagnosis import identify
 from ident.excitation import operating_points
 from robot_assets.robot import load_robot
 from sim import run_experiment

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from ident.diagnose import diagnose_fully
+from ident.diagnosis import diagnose_fully
 from ident.excitation import make_plan, operating_points
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment

@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from ident.diagnose import identify
+from ident.diagnosis import identify
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.excitation import LOOP_HZ, Excitation, make_plan, operating_points
 from ident.frf import FRF, Blocks, average, estimate_frf

@@ -15,7 +15,7 @@ import numpy as np
 
 from ident.conclude import baseline_values, reported_parameters
 from ident.dataset import Dataset
-from ident.diagnose import identify
+from ident.diagnosis import identify
 from ident.excitation import operating_points
 from ident.extended import Effect, Model, along_record
 from ident.gain import measure_gain, segment_errors

@@ -34,7 +34,7 @@ from sizing import brought_to, distortion, noise_power, spectra
 
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnose import diagnose_fully
+from ident.diagnosis import diagnose_fully
 from ident.excitation import Experiment, Plan, operating_points
 from ident.parallel import open_executor
 from robot_assets.errors import DataError

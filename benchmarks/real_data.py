@@ -17,7 +17,7 @@ from provenance import commit
 
 from ident.convert import convert_logs
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnose import diagnose_fully
+from ident.diagnosis import diagnose_fully
 from ident.show.figures import trace_figure
 from ident.units import torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis

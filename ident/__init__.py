@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ident.dataset import Dataset, Segment
     from ident.dataset_io import load_dataset, save_dataset
-    from ident.diagnose import diagnose, diagnose_fully, identify
+    from ident.diagnosis import diagnose, diagnose_fully, identify
     from ident.frf import estimate_frf
     from ident.show.simulated_gain import simulated_gain
 
@@ -16,9 +16,9 @@ _HOMES = {
     "Segment": "ident.dataset",
     "load_dataset": "ident.dataset_io",
     "save_dataset": "ident.dataset_io",
-    "diagnose": "ident.diagnose",
-    "diagnose_fully": "ident.diagnose",
-    "identify": "ident.diagnose",
+    "diagnose": "ident.diagnosis",
+    "diagnose_fully": "ident.diagnosis",
+    "identify": "ident.diagnosis",
     "estimate_frf": "ident.frf",
     "simulated_gain": "ident.show.simulated_gain",
 }

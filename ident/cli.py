@@ -229,7 +229,7 @@ def diagnose(
 ) -> None:
     """Everything: verdict.json, report.html, recording.rrd, model.toml and model.xml."""
     from ident.dataset_io import load_dataset
-    from ident.diagnose import diagnose_fully
+    from ident.diagnosis import diagnose_fully
     from ident.parallel import open_executor
     from ident.show.outputs import write_outputs
 
@@ -254,7 +254,7 @@ def demo(
     import numpy as np
 
     from ident.dataset_io import load_dataset, save_dataset
-    from ident.diagnose import diagnose_fully
+    from ident.diagnosis import diagnose_fully
     from ident.show.outputs import write_outputs
     from sim import draw_effect, run_experiment
     from sim.effects import parameters_of
@@ -297,7 +297,7 @@ DEMO_EFFECTS = (
 
 def _demo_real(name: str, out: Path, json_: bool, quiet: bool) -> None:
     from ident.dataset_io import load_dataset
-    from ident.diagnose import diagnose_fully
+    from ident.diagnosis import diagnose_fully
     from ident.show.outputs import write_outputs
 
     shipped = Path(__file__).parent / "real"

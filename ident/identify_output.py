@@ -12,7 +12,7 @@ import numpy as np
 
 from ident.conclude import baseline_values
 from ident.dataset import Dataset
-from ident.diagnose import identify
+from ident.diagnosis import identify
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.frf import estimate_frf
 from ident.graybox import Parameters, build_structure

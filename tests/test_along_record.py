@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.attribute import as_loops
-from ident.diagnose import set_up
+from ident.diagnosis import set_up
 from ident.extended import Effect, Model, along_record, is_along_record, joints_along_record, predict
 from ident.hypotheses import catalogue, kernels
 from ident.hypotheses.yielding import elastoplastic

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ident.diagnose import diagnose
+from ident.diagnosis import diagnose
 from sim import draw_effect, run_experiment
 from sim.effects import parameters_of
 from sim.experiment import draw_drives
@@ -130,7 +130,7 @@ def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
 
     import mujoco
 
-    from ident.diagnose import diagnose_fully
+    from ident.diagnosis import diagnose_fully
     from ident.show.export import write_mjcf
 
     coefficient = 60.0

@@ -23,7 +23,7 @@ from ident.attribute import (
 )
 from ident.baseline import astray
 from ident.conclude import conclude, faint_note
-from ident.diagnose import diagnose, harmful, identify
+from ident.diagnosis import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
 from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
@@ -345,7 +345,7 @@ def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
 
 
 def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
-    from ident.diagnose import LEAST_NOISE, _noise
+    from ident.diagnosis import LEAST_NOISE, _noise
 
     data = clean[0]
     t = np.arange(len(data.segments[0].t))[:, None] / data.sample_rate

@@ -8,7 +8,7 @@ import pytest
 
 from ident.attribute import LEFT_TO_DECOYS, Attribution, Round, attribute, temper_of, told_share, weighed_round
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
-from ident.diagnose import diagnose, explained
+from ident.diagnosis import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
 from ident.extended import Effect, along_record
 from ident.faint import ALONG, LINEAR, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
@@ -205,9 +205,9 @@ def test_a_diagnosis_asks_held_out_data_about_its_causes(clean, identified, hypo
         asked.append((groups, of))
         return True
 
-    monkeypatch.setattr("ident.diagnose.identify", lambda *args, **rest: (setup, baseline))
-    monkeypatch.setattr("ident.diagnose.attribute", lambda *args, **rest: Attribution(baseline, True, 0.0, (found,), final, False))
-    monkeypatch.setattr("ident.diagnose.denied", deny)
+    monkeypatch.setattr("ident.diagnosis.identify", lambda *args, **rest: (setup, baseline))
+    monkeypatch.setattr("ident.diagnosis.attribute", lambda *args, **rest: Attribution(baseline, True, 0.0, (found,), final, False))
+    monkeypatch.setattr("ident.diagnosis.denied", deny)
     verdict = diagnose(clean[0])
     assert asked == [(setup.held_out, found)]
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN

@@ -277,7 +277,7 @@ def bare_motion(robot, q, tau):
 @pytest.mark.parametrize("name", ["twomass", "ur10"])
 @pytest.mark.parametrize("kind", ["short", "zeros", "still", "noise"])
 def test_a_log_that_can_decide_nothing_is_one_line(name, kind):
-    from ident.diagnose import diagnose
+    from ident.diagnosis import diagnose
 
     robot, rng = load_robot(name), np.random.default_rng(0)
     N = 60 if kind == "short" else 1500
@@ -293,7 +293,7 @@ def test_a_log_that_can_decide_nothing_is_one_line(name, kind):
 
 
 def test_positions_in_a_unit_that_cannot_be_are_one_line(ur10):
-    from ident.diagnose import diagnose
+    from ident.diagnosis import diagnose
 
     wave = np.sin(np.arange(1500) / 80.0)[:, None] * np.ones(6)
     assert "positions" in outcome(diagnose, bare_motion(ur10, 1e6 * wave, wave))
@@ -304,7 +304,7 @@ def test_a_log_of_mislabelled_torques_names_no_cause(tmp_path):
     """Its torques are those of another sign: what is left then fits many an effect well."""
     from dataclasses import replace
 
-    from ident.diagnose import diagnose
+    from ident.diagnosis import diagnose
     from sim import run_experiment
     from tests.conftest import small_plan
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ident.baseline import discrepancy_p_value
-from ident.diagnose import diagnose, set_up
+from ident.diagnosis import diagnose, set_up
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.extended import Effect, Model, predict
 from ident.frf import estimate_frf

@@ -2,9 +2,13 @@
 
 import ast
 import importlib
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+import ident
 
 ROOT = Path(__file__).parent.parent
 SIM_MAY = {"ident.dataset", "ident.excitation"}
@@ -42,3 +46,20 @@ def test_assets_know_no_engine(path):
 def test_every_benchmark_can_be_imported(path, monkeypatch):
     monkeypatch.syspath_prepend(str(path.parent))
     importlib.import_module(path.stem)
+
+
+def test_the_public_names_are_what_a_user_imports():
+    """In a fresh process: a submodule of the same name would take the place of a function as soon as it is imported."""
+    code = (
+        "from ident import load_dataset, estimate_frf, identify, diagnose\n"
+        "import ident, types\n"
+        "again = [getattr(ident, name) for name in ident.__all__]\n"
+        "assert all(callable(f) for f in [load_dataset, estimate_frf, identify, diagnose, *again])\n"
+        "assert not any(isinstance(f, types.ModuleType) for f in again)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_no_public_name_is_that_of_a_submodule():
+    modules = {path.stem for path in (ROOT / "ident").iterdir()}
+    assert not modules & set(ident.__all__)

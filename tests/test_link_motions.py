@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnose import diagnose, diagnose_fully, set_up
+from ident.diagnosis import diagnose, diagnose_fully, set_up
 from ident.extended import Model
 from ident.link_sensor import LinkDelay, comparable_links, with_link_encoders
 from ident.torque_fit import data_count, data_counts, jacobian, pack, predictions, unpack

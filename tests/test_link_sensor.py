@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ident.diagnose import diagnose
+from ident.diagnosis import diagnose
 from sim import run_experiment
 from sim.effects import make_effect
 from sim.experiment import draw_drives

@@ -6,7 +6,7 @@ from multiprocessing import get_context
 
 import pytest
 
-from ident.diagnose import diagnose
+from ident.diagnosis import diagnose
 from ident.parallel import Workers, map_threads, open_executor, thread_count
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot

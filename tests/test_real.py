@@ -8,7 +8,7 @@ import pytest
 from ident.checking import inspect_dataset
 from ident.convert import convert_logs
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnose import diagnose_fully, set_up
+from ident.diagnosis import diagnose_fully, set_up
 from ident.hypotheses.friction import direction
 from robot_assets.errors import DataError
 

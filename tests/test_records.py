@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ident.dataset import Dataset, Segment
-from ident.diagnose import diagnose, set_up
+from ident.diagnosis import diagnose, set_up
 from ident.extended import Effect, Model, predict
 from ident.gain import mean_squares, stretch_squares
 from ident.hypotheses import catalogue

@@ -6,7 +6,7 @@ import pytest
 from benchmarks.bench_export import both_gains
 from ident import simulated_gain
 from ident.dataset_io import load_dataset
-from ident.diagnose import diagnose_fully, set_up
+from ident.diagnosis import diagnose_fully, set_up
 from ident.excitation import operating_points
 from ident.extended import Model, predict
 from ident.records import build_groups

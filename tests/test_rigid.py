@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ident.attribute import plainer
 from ident.dataset import Dataset, Segment
-from ident.diagnose import diagnose_fully, identify, set_up, with_held_out
+from ident.diagnosis import diagnose_fully, identify, set_up, with_held_out
 from ident.extended import Effect, Model, predict
 from ident.graybox import LinkChange, Parameters, build_structure
 from ident.hypotheses import catalogue

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from ident.dataset import Dataset
-from ident.diagnose import SEED, identify, with_held_out
+from ident.diagnosis import SEED, identify, with_held_out
 from ident.extended import Model, predict
 from ident.gain import Errors, mean_squares, measure_gain
 from ident.graybox import parameter_names
