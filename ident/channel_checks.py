@@ -159,13 +159,23 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
     around = np.pad(even, ((1, 1), (0, 0)))
     # A joint that speeds up takes longer and longer steps: about a sample that is lost they are as usual.
     double = (np.abs(np.abs(step) - 2 * usual) < 0.3 * usual) & fast & around[:-2] & around[2:]
-    jumps = int(np.sum(moving & (double.sum(axis=1) > 0.6 * fast.sum(axis=1))))
+    found = moving & (double.sum(axis=1) > 0.6 * fast.sum(axis=1))
+    jumps = int(np.sum(found & ~_recurring(found, s.period)))
     out = []
     if repeated > max(1, 1e-4 * len(rows)):
         out.append(f"{repeated} samples ({repeated / len(rows):.1%}) repeat the one before in all channels, in motion: lost packets")
     if jumps > max(2, 1e-3 * moving.sum()):
         out.append(f"{jumps} double steps of position between samples: dropped samples")
     return out
+
+
+def _recurring(found: np.ndarray, period: int | None) -> np.ndarray:
+    """(N,) whether what was found at a sample is found in half of the periods there: it is of the motion, not of the log."""
+    if period is None or len(found) < 2 * period:
+        return np.zeros(len(found), bool)
+    place = np.arange(len(found)) % period
+    often = np.bincount(place, weights=found, minlength=period) >= 0.5 * (len(found) // period)
+    return often[place]
 
 
 def _resolution(step: np.ndarray) -> float:

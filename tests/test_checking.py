@@ -237,3 +237,21 @@ def test_lost_motion_of_a_gear_is_no_skew_of_the_channels():
             bent = replace(s, tau=s.tau + 0.1 * s.tau.std(axis=0) * np.array(followed))
             false += torque_skew(bent, dataset(robot, bent)).sure
     assert false == 0
+
+
+def test_long_steps_of_every_period_are_no_lost_samples():
+    """A multisine of few samples per cycle takes double steps by itself, and each period takes them again."""
+    robot, period = load_robot("twomass"), 200
+    rng = np.random.default_rng(6)
+    lines = np.arange(1, 30, 2)
+    phases = 2 * np.pi * np.outer(np.arange(4 * period), lines) / period + rng.uniform(0, 2 * np.pi, len(lines))
+    q = np.cos(phases).sum(axis=1)[:, None] + 1e-6 * rng.normal(size=(4 * period, 1))
+    t = np.arange(len(q)) / 200.0
+    s = Segment("a", "multisine", "identification", t, 0.1 * q, q, period=period, periods=4)
+    among = replace(dataset(robot, s), sample_rate=200.0)
+    assert lost_sample_warnings(s, among) == []
+    assert lost_sample_warnings(replace(s, kind="trajectory", period=None, periods=None), among) != []
+    slow = np.cos(2 * np.pi * np.arange(4000) / 1000.0)[:, None]
+    gone = np.delete(slow, np.arange(150, 3800, 301), axis=0)
+    short = replace(s, t=np.arange(len(gone)) / 200.0, tau=0.1 * gone, q=gone, period=1000, periods=4)
+    assert "double steps" in lost_sample_warnings(short, among)[0]
