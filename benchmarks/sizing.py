@@ -23,12 +23,15 @@ NEIGHBOURS = 9  # lines over which the noise of a line is averaged: few periods 
 TRIALS = 12  # sizes found out, at most
 NEAR = 0.1  # logarithm of the ratio to the target within which an effect is there
 LONGEST = 4.0  # step of log strength
+LARGEST = float(np.log(30.0))  # log strength: a gear with a gap of degrees is another machine
 EDGE = 0.1  # share of the way between too little and too much, at either end, where no secant is followed
 SLOPES = 0.3, 3.0  # of log size over log strength that a step believes
 
 
 def brought_to(stronger: Callable[[float], E], size: Callable[[E], float], target: float) -> E:
     """The effect of a size, by secants of the logarithm of size over that of strength; the nearest where none is found.
+
+    The strength ends where no machine has such an effect: one that hardly shows is left small.
 
     Between a strength that does too little and one that does too much in halves, where the secant leads out of there or to
     an end: such effects do nothing and all at once, as a limit does that the torque just reaches.
@@ -54,6 +57,9 @@ def brought_to(stronger: Callable[[float], E], size: Callable[[E], float], targe
         margin = EDGE * (high - low) if np.isfinite(high - low) else 0.0
         if not low + margin < step < high - margin:
             step = 0.5 * (low + high)
+        step = min(step, LARGEST)
+        if low >= LARGEST:
+            break
     return min(found, key=lambda x: abs(x[1]))[2]
 
 

@@ -32,12 +32,13 @@ from ident.graybox import (
     impedance,
     linearise,
 )
-from ident.mixing import MEMORY, mixed
+from ident.mixing import mixed
 from ident.records import Group
 from ident.recursion import chain_of, newton_euler
 
-REMAINDER_STEPS = 60  # fixed-point steps at most for the geometric remainder from a cold start
-REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them
+REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder
+REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
+NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
 REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
 REACTION_CHANGE = 1e-5  # relative change that ends them
 
@@ -311,26 +312,35 @@ def solve(
         react: torques that go with a solution; the result is consistent with them. None holds
             ``torques``.
         passes: of ``react`` at most until they do; one where it is exact by itself.
-        steps: fixed-point steps on the remainder.
+        steps: fixed-point steps on the remainder, at most; a start that is near ends them sooner.
+
+    Raises:
+        FloatingPointError: the motion of the links runs away.
     """
     if Q is None:
         Q = true_position(group, par, sampling)
+    enough = NEAR_CHANGE
     if W is None:
-        W = static_remainder(structure, par, plane, group)
+        W, enough = static_remainder(structure, par, plane, group), REMAINDER_CHANGE
     if react is not None:
         torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-    past: list[tuple[np.ndarray, np.ndarray]] = []
+    left, past = np.arange(len(W)), []
     for _ in range(steps):
         Q_a = link_motion(structure, par, plane, Q, W, torques)
         change = geometric_remainder(structure, plane, group, Q_a) - W
         if not np.all(np.isfinite(change)):
             raise FloatingPointError("the motion of the links cannot be solved")
-        past = [*past[-MEMORY:], (W, change)]
-        W = mixed(past)
+        # Where links hang on lightly damped gears the plain step leads away along many directions: all are remembered.
+        past = [*past, (W[left], change[left])]
+        W = W.copy()
+        W[left] = mixed(past)
         if react is not None:
             torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-        if np.abs(change).max() < REMAINDER_CHANGE * np.abs(W).max():
+        moving = np.abs(change[left]).max(axis=(1, 2)) >= enough * np.abs(W).max()
+        if not np.any(moving):
             break
+        if not np.all(moving):
+            left, past = left[moving], [(x[moving], f[moving]) for x, f in past]
     return _solution(structure, par, plane, Q, W, torques)
 
 

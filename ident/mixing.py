@@ -21,11 +21,11 @@ def mixed(past: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     x, f = past[-1]
     if len(past) == 1:
         return x + f
-    dx = np.stack([x - a for a, _ in past[:-1]])
-    df = np.stack([f - b for _, b in past[:-1]])
-    flat, last = df.reshape(*df.shape[:2], -1), f.reshape(len(f), -1)
-    A = np.einsum("ask,bsk->sab", flat.conj(), flat, optimize=True).real
-    b = np.einsum("ask,sk->sa", flat.conj(), last, optimize=True).real
+    steps = np.stack([(x - a).reshape(len(x), -1) for a, _ in past[:-1]], axis=1)
+    turns = np.stack([(f - b).reshape(len(f), -1) for _, b in past[:-1]], axis=1)
+    # Real and imaginary parts side by side.
+    R, last = (np.ascontiguousarray(y).view(float) for y in (turns, f.reshape(len(f), -1)))
+    A, b = R @ R.transpose(0, 2, 1), R @ last[..., None]
     ridge = 1e-12 * np.trace(A, axis1=1, axis2=2) + 1e-300
-    share = np.linalg.solve(A + ridge[:, None, None] * np.eye(len(dx)), b[..., None])[..., 0]
-    return x + f - np.einsum("as...,sa->s...", dx + df, share, optimize=True)
+    share = np.linalg.solve(A + ridge[:, None, None] * np.eye(A.shape[1]), b)
+    return x + f - (share.transpose(0, 2, 1) @ (steps + turns)).reshape(x.shape)

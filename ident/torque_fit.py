@@ -26,7 +26,7 @@ from ident.extended import (
     through_drives,
 )
 from ident.graybox import Parameters, Structure, parameter_names
-from ident.inverse import Motion, Sampling, Torques, baseline_products
+from ident.inverse import REMAINDER_STEPS, Motion, Sampling, Torques, baseline_products
 from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
 from ident.records import Group
@@ -48,7 +48,6 @@ RIDGE = 1e-12  # relative, of a covariance
 LEAK = 0.03  # of the largest share of that noise, that is in any direction too
 LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
 SHORTER = 64.0  # factor on the damping of steps then
-SETTLING_STEPS = 12  # of the remainder, before that
 SLIGHT = 2.0  # fall of the cost that tells nothing
 FORETOLD = 0.1  # error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
 
@@ -526,7 +525,7 @@ def fit(
     count = data_count(problem)
     prior[:m] += hold * count
     x = pack(model)
-    preds = predictions(problem, model, Ws, steps=None if Ws[0] is None else 1)
+    preds = predictions(problem, model, Ws, steps=REMAINDER_STEPS)
     Ws = [p.solution.W for p in preds]
     if weights is None:
         weights = make_weights(problem, preds, rho)
@@ -564,7 +563,7 @@ def fit(
                 if not np.all(np.isfinite(step)):
                     raise FloatingPointError("a step without a size")
                 trial = unpack(model, x + step, limit)
-                new = predictions(problem, trial, Ws, steps=int(new_chain or fine), near=preds)
+                new = predictions(problem, trial, Ws, steps=REMAINDER_STEPS if new_chain or fine else 0, near=preds)
                 new_cost = weighted_cost(problem, new, weights)
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                 new_cost = np.inf
@@ -614,20 +613,17 @@ Settled = tuple[Model, list[Prediction], list[np.ndarray], float]
 
 
 def _settled(problem: Problem, last: Settled, model: Model, weights: Weights) -> Settled:
-    """``model`` with geometric remainders a step towards its own, or more where one leads away, else ``last``.
+    """``model`` with its own geometric remainders, else ``last``.
 
     Steps are taken with the remainder held. Where the links hang on gears that are far too soft the
     remainder answers them so strongly that a step which lowers the cost raises it in truth.
     """
-    for steps in (1, SETTLING_STEPS):
-        try:
-            preds = predictions(problem, model, last[2], steps=steps, near=last[1])
-            cost = weighted_cost(problem, preds, weights)
-        except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-            continue
-        if cost < LOST * last[3]:
-            return model, preds, [p.solution.W for p in preds], cost
-    return last
+    try:
+        preds = predictions(problem, model, last[2], steps=REMAINDER_STEPS, near=last[1])
+        cost = weighted_cost(problem, preds, weights)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return last
+    return (model, preds, [p.solution.W for p in preds], cost) if cost < LOST * last[3] else last
 
 
 def _moves_links(model: Model) -> np.ndarray:
