@@ -6,7 +6,12 @@ import scipy.integrate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ident.diagnosis import set_up
+from ident.extended import Effect, Model, predict
+from ident.hypotheses import catalogue
 from ident.hypotheses.yielding import SLIP, along_path, bristle, elastoplastic, yielded, yielding_point
+from sim import parse_effect, run_experiment
+from tests.conftest import small_plan, through_files
 
 STIFFNESS, LIMIT = 80.0, 0.2
 EXPONENTS = [(1.0, 0.0), (1.0, 1.0), (2.0, 0.5), (4.0, 1.2), (12.0, 0.0)]
@@ -85,3 +90,26 @@ def test_the_step_of_a_loop_solves_its_equation(exponent, recoil, start, free, g
     dx, h = yielding_point(STIFFNESS, LIMIT, exponent, recoil, start * LIMIT, free * at, give / STIFFNESS, near * at)
     assert h == pytest.approx(yielded(STIFFNESS, LIMIT, exponent, recoil, start * LIMIT, dx)[0], abs=1e-4 * LIMIT)
     assert dx + give / STIFFNESS * h == pytest.approx(free * at, abs=1e-4 * at)
+
+
+def test_a_bristle_goes_on_from_where_it_is_told():
+    v = np.random.default_rng(2).normal(size=(2, 400))
+    whole = bristle(v, 1e-3, 5e-3, start=np.array([0.7, -0.2]))
+    assert whole[:, 0] == pytest.approx([0.7, -0.2])
+    later = bristle(v[:, 150:], 1e-3, 5e-3, start=whole[:, 150])
+    assert later == pytest.approx(whole[:, 150:], abs=1e-12)
+
+
+def test_the_record_says_what_friction_holds_where_a_motion_begins(ur10, tmp_path):
+    """The motion that closes a recording was not made, and leaves nothing in the bristles."""
+    hidden = parse_effect("presliding_friction@elbow_joint:stiffness=2000,coulomb=8", ur10)
+    plan = small_plan(ur10, 3, points=1, levels=(1.0,), trajectory=True)
+    setup = set_up(through_files(run_experiment(plan, [hidden], seed=3), tmp_path))
+    problem = setup.problem
+    (group,) = (g for g in (*problem.groups, *setup.held_out) if g.window is not None)
+    law = next(h for h in catalogue(problem.structure) if h.key == ("presliding_friction", "elbow_joint"))
+    truth = Effect(law, np.array([2000.0, 8.0, 1.0]))
+    pred = predict(Model(problem.structure, problem.nominal, (truth,)), group, problem.sampling)
+    left = np.abs(group.to_time(group.U - pred.U)[0, :, 2])[group.window > 0.99]
+    second = round(1.0 / group.period_time * group.n_time)
+    assert np.sqrt(np.mean(left[:second] ** 2)) < 0.02 * 8.0

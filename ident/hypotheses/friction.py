@@ -18,6 +18,7 @@ LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
+START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
 
@@ -45,6 +46,17 @@ def sense(motion: Motion, j: int, smoothing: float, size: np.ndarray | float | N
     if size is None:
         size = np.quantile(np.abs(asked[:, rest[:, j]]), REST_QUANTILE)
     return np.where(rest[:, j], np.clip(asked / np.maximum(size, LEAST_TORQUE), -1.0, 1.0), s)
+
+
+def held_at_start(motion: Motion, j: int, size: float) -> np.ndarray | None:
+    """(S,) friction with memory over its ``size`` where a motion begins; None where it repeats.
+
+    What it holds then was left by motions that were not recorded: the recorded torque tells it.
+    """
+    if motion.group.window is None:
+        return None
+    first = max(1, round(START_TIME / motion.time_step))
+    return np.clip(motion.asked(j)[:, :first].mean(axis=1) / size, -1.0, 1.0)
 
 
 def coulomb_friction(joint: int, place: str) -> Hypothesis:
@@ -150,7 +162,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
             replace(EXPONENT, center=DAHL, null=DAHL),
         ),
-        lambda p, motion, j, k: p[1] * bristle(motion.v(j), motion.time_step, p[1] / p[0], p[2]),
+        lambda p, motion, j, k: p[1] * bristle(motion.v(j), motion.time_step, p[1] / p[0], p[2], held_at_start(motion, j, p[1])),
         lambda scale: [(f * max(scale.q, LEAST_MOTION),) for f in (0.01, 0.03, 0.1, 0.3, 1.0)],
         screen,
         "The residual torque of {joint} makes loops in position: friction that yields as a spring of"

@@ -21,27 +21,42 @@ def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
     return along_path(x - np.roll(x, 1, axis=1), stiffness, limit, SLIP, 0.0)
 
 
-def bristle(v: np.ndarray, dt: float, length: float, exponent: float = DAHL) -> np.ndarray:
+def bristle(
+    v: np.ndarray, dt: float, length: float, exponent: float = DAHL, start: np.ndarray | None = None
+) -> np.ndarray:
     """Torque of a bristle of unit Coulomb torque along one period of a velocity ``v`` (S, T), rad/s.
 
     Args:
         dt: s; length: breakaway distance, Coulomb torque over bristle stiffness, rad.
         exponent: Dahl's where nothing is said: exact then over steps of constant velocity.
+        start: (S,) torque at the first instant; what the period before has left where None.
     """
-    return along_path(0.5 * dt * (v + np.roll(v, 1, axis=1)), 1.0 / length, 1.0, exponent, 1.0)
+    steps = 0.5 * dt * (v + np.roll(v, 1, axis=1))
+    if start is None:
+        return along_path(steps, 1.0 / length, 1.0, exponent, 1.0)
+    steps[:, 0] = 0.0
+    return onward(steps, 1.0 / length, 1.0, exponent, 1.0, start)
 
 
 @njit(cache=True, nogil=True)
 def along_path(steps: np.ndarray, stiffness: float, limit: float, exponent: float, recoil: float) -> np.ndarray:
     """Torque of an element that yields along the steps (S, T) of one period, after one period before it."""
+    before = onward(steps, stiffness, limit, exponent, recoil, np.zeros(len(steps)))
+    return onward(steps, stiffness, limit, exponent, recoil, before[:, -1])
+
+
+@njit(cache=True, nogil=True)
+def onward(
+    steps: np.ndarray, stiffness: float, limit: float, exponent: float, recoil: float, start: np.ndarray
+) -> np.ndarray:
+    """Torque (S, T) of an element that yields along steps from a torque ``start`` (S,)."""
     S, T = steps.shape
     out = np.empty((S, T))
     for i in range(S):
-        h = 0.0
-        for _ in range(2):
-            for t in range(T):
-                h, _slope = yielded(stiffness, limit, exponent, recoil, h, steps[i, t])
-                out[i, t] = h
+        h = start[i]
+        for t in range(T):
+            h, _slope = yielded(stiffness, limit, exponent, recoil, h, steps[i, t])
+            out[i, t] = h
     return out
 
 
