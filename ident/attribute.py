@@ -30,7 +30,7 @@ from ident.evidence import (
     rivals_of_best,
     weigh,
 )
-from ident.extended import Effect, is_along_record
+from ident.extended import Effect, Model, is_along_record
 from ident.faint import SEEN, hidden
 from ident.hypotheses import Hypothesis, catalogue
 from ident.parallel import Workers
@@ -183,6 +183,7 @@ def attribute(
         hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
     if looped is not current and not workers.late:
         current = as_loops(problem, current, workers)
+    current = without_shadows(problem, current, rounds, workers)
     current, rounds = weighed_again(problem, current, rounds, workers)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
@@ -394,6 +395,32 @@ def companions(
         if e.hypothesis.key not in before
     ]
     return last, rounds
+
+
+def without_shadows(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> Fit:
+    """The model without companions of a friction that the data do not need beside a cause that was found after them.
+
+    They competed with no other hypothesis, and made up for that cause as long as it was missing.
+    """
+    alone = {r.candidates[0].hypothesis.key for r in rounds if len(r.candidates) == 1 and r.before is not rounds[-1].before}
+    doubted = [e.hypothesis for e in current.model.effects if e.hypothesis.key in alone]
+    if not doubted or workers.late:
+        return current
+
+    def without(gone: Sequence[Hypothesis]) -> Model:
+        keys = {h.key for h in gone}
+        return replace(current.model, effects=tuple(e for e in current.model.effects if e.hypothesis.key not in keys))
+
+    def rise(gone: Sequence[Hypothesis]) -> float:
+        other = refit(problem, without(gone), current.weights, current.remainders, POLISH_STEPS)
+        return np.inf if other is None else other.cost - current.cost
+
+    least = MIN_EVIDENCE * max(1.0, current.chi2_per_dof)
+    rises = workers.map_in_time(lambda h: rise([h]), doubted, lambda h: f"without: {h.effect} at {h.place}")
+    gone = [h for h, x in zip(doubted, rises, strict=True) if x is not None and x < least]
+    if not gone or (len(gone) > 1 and rise(gone) >= least * len(gone)):
+        return current
+    return polish(problem, replace(current, model=without(gone)))
 
 
 def renamed(rounds: Sequence[Round], before: Sequence[Effect], after: Sequence[Effect]) -> list[Round]:

@@ -20,6 +20,7 @@ from ident.attribute import (
     settles_its_joint,
     shadows,
     with_name,
+    without_shadows,
 )
 from ident.baseline import astray
 from ident.conclude import conclude, faint_note
@@ -639,7 +640,8 @@ def test_a_start_that_loses_the_data_is_not_followed(identified, named):
     assert refit(setup.problem, large, result.weights, result.remainders, 1) is not None
 
 
-def test_an_effect_that_the_data_need_stays(ur10, tmp_path):
+def test_an_effect_that_the_data_need_stays_and_a_companion_that_they_do_not_goes(ur10, tmp_path):
+    """A friction at another joint, found with that of this one before a later cause, made up for what was missing."""
     hidden = parse_effect("coulomb_friction@elbow_joint:torque=5", ur10)
     data = through_files(run_experiment(small_plan(ur10, 8, points=1, levels=(1.0,)), [hidden], seed=8), tmp_path)
     setup, result = identify(data)
@@ -647,6 +649,15 @@ def test_an_effect_that_the_data_need_stays(ur10, tmp_path):
     model = replace(result.model, effects=(Effect(rub, np.array([3.0, 0.0, 1e-3])),))
     fitted = polish(setup.problem, replace(result, model=model))
     assert pruned(setup.problem, fitted) is fitted
+
+    of = {h.key: h for h in catalogue(setup.problem.structure)}
+    slip = Effect(of["presliding_friction", "wrist_2_joint"], np.array([500.0, 0.02, 1.0]))
+    both = polish(setup.problem, replace(fitted, model=replace(fitted.model, effects=(*fitted.model.effects, slip))))
+    frictions = [SimpleNamespace(before=result, candidates=(Candidate(h, None, 0.0, 1.0),)) for h in (rub, slip.hypothesis)]
+    later = SimpleNamespace(before=both, candidates=(Candidate(of["cogging", "wrist_3_joint"], None, 0.0, 1.0),))
+    assert without_shadows(setup.problem, both, frictions, Workers()) is both
+    left = without_shadows(setup.problem, both, [*frictions, later], Workers())
+    assert [e.hypothesis for e in left.model.effects] == [rub]
 
 
 def test_a_coordinate_that_the_data_do_not_feel_has_a_large_deviation():
