@@ -336,7 +336,7 @@ def solve(
         W[left] = mixed(past)
         if react is not None:
             torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-        moving = np.abs(change[left]).max(axis=(1, 2)) >= enough * np.abs(W).max()
+        moving = np.abs(change[left]).max(axis=(1, 2)) > enough * np.abs(W).max()
         if not np.any(moving):
             break
         if not np.all(moving):

@@ -295,6 +295,7 @@ def test_earlier_causes_are_weighed_again_before_more_is_sought(identified, hypo
     monkeypatch.setattr("ident.attribute.polish", lambda problem, result: result)
     monkeypatch.setattr("ident.attribute.plainer", lambda problem, current, *rest: current)
     monkeypatch.setattr("ident.attribute.companions", lambda problem, current, *rest: (current, []))
+    monkeypatch.setattr("ident.attribute.without_shadows", lambda problem, current, *rest: current)
     monkeypatch.setattr("ident.attribute.rematched", rematched)
     monkeypatch.setattr("ident.attribute.pruned", pruned)
     attribute(setup.problem, loud)
