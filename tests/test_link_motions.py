@@ -38,7 +38,7 @@ def still(ur10, tmp_path_factory):
 @pytest.mark.parametrize(
     ("text", "figure", "value"),
     [
-        ("hardening_stiffness@shoulder_lift_joint:cubic=3e10", "cubic", 3e10),
+        pytest.param("hardening_stiffness@shoulder_lift_joint:cubic=3e10", "cubic", 3e10, marks=pytest.mark.slow),
         pytest.param("backlash@shoulder_pan_joint:gap=4e-4", "gap", 4e-4, marks=pytest.mark.slow),
     ],
 )

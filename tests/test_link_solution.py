@@ -1,0 +1,39 @@
+"""The motion of the links along a given motion of the motors: a fixed point of the geometric remainder."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident import inverse
+from ident.diagnosis import set_up
+from ident.extended import Model, predict
+from ident.inverse import REMAINDER_STEPS, geometric_remainder, make_plane, solve, true_position
+from robot_assets.robot import load_robot
+from sim import run_experiment
+from tests.conftest import small_plan, through_files
+
+
+@pytest.mark.parametrize("share", [1.0, 0.03])
+def test_links_on_lightly_damped_gears_are_solved_along_large_motions(clean, share):
+    """Where gears hardly damp the plain step of the remainder leads away along many directions."""
+    problem = set_up(clean[0]).problem
+    group = next(g for g in problem.groups if g.window is None)
+    light = replace(problem.nominal, damping=share * problem.nominal.damping)
+    structure, par = Model(problem.structure, light).built()
+    plane = make_plane(structure, par, group, problem.sampling)
+    large = true_position(group, par, problem.sampling).copy()
+    large[:, 1:] *= 6.0
+    found = solve(structure, par, plane, group, problem.sampling, Q=large, steps=REMAINDER_STEPS)
+    left = geometric_remainder(structure, plane, group, found.Q_a) - found.W
+    assert np.abs(left).max() < 1e-5 * np.abs(found.W).max()
+
+
+def test_a_single_axis_without_a_remainder_takes_one_step(tmp_path, monkeypatch):
+    robot = load_robot("twomass")
+    problem = set_up(through_files(run_experiment(small_plan(robot, 4, period=1000), [], seed=4), tmp_path)).problem
+    asked = []
+    plain = inverse.geometric_remainder
+    monkeypatch.setattr(inverse, "geometric_remainder", lambda *args: asked.append(1) or plain(*args))
+    predict(Model(problem.structure, problem.nominal), problem.groups[0], problem.sampling)
+    assert len(asked) == 1
