@@ -17,7 +17,7 @@ from ident.graybox import linearise
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
 from ident.parallel import map_threads
-from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error
+from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error, prior_of
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
@@ -31,7 +31,11 @@ MOVED = 1e-3  # rad, by which the arm is put elsewhere to see what its posture d
 
 @dataclass(frozen=True)
 class Score:
-    """Best unit response of a hypothesis: fall of the cost, its degrees of freedom, a start."""
+    """Best unit response of a hypothesis: fall of the cost, its degrees of freedom, a start.
+
+    ``step`` (p,) is what the coordinates that are fitted already do in the same linear step, as a gear does that has
+    taken the place of a spring beside it; None where it is not known.
+    """
 
     hypothesis: Hypothesis
     gain: float
@@ -39,6 +43,7 @@ class Score:
     start: np.ndarray | None
     weights: np.ndarray
     shape: tuple[float, ...]
+    step: np.ndarray | None = None
 
 
 def signal_scale(
@@ -94,7 +99,9 @@ def screen(
 
 @dataclass(frozen=True)
 class _Stage:
-    """What all hypotheses are held against: whitened residual, fitted coordinates, normal matrix.
+    """What all hypotheses are held against: whitened residual, fitted coordinates, inverse of their normal matrix.
+
+    ``damped`` is that inverse with what is known of the coordinates beforehand, for steps.
 
     ``residuals`` (S, K, n), ``columns`` (S, K, n, p) and ``moved`` (S, K, n, joints) per group, complex; the last is what
     a constant unit torque in a gear does by the posture to which it moves the arm, none for motions.
@@ -109,6 +116,7 @@ class _Stage:
     moved: tuple[np.ndarray | None, ...]
     inverse: np.ndarray
     moment: np.ndarray
+    damped: np.ndarray
 
     @classmethod
     def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
@@ -128,8 +136,9 @@ class _Stage:
         moment = sum(J.T @ as_real(r[..., None])[:, 0] for J, r in zip(real, residuals, strict=True))
         size = np.sqrt(np.maximum(np.diag(H), 1e-30))
         inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-10, hermitian=True) / np.outer(size, size)
+        _, prior = prior_of(problem, fit.model)
         motions = tuple(pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True))
-        return cls(problem, fit, predictions, motions, residuals, columns, moved, inverse, moment)
+        return cls(problem, fit, predictions, motions, residuals, columns, moved, inverse, moment, np.linalg.inv(H + np.diag(prior)))
 
 
 @dataclass(frozen=True)
@@ -224,7 +233,8 @@ def _score(
         return None
     weights = np.linalg.pinv(P, rcond=1e-9, hermitian=True) @ y
     c = weights / size
-    return Score(h, float(y @ weights), len(c), _start(start, c, h, shape, stage.problem), c, shape)
+    step = stage.damped @ (stage.moment - total.columns @ c)
+    return Score(h, float(y @ weights), len(c), _start(start, c, h, shape, stage.problem), c, shape, step)
 
 
 def _lines(motion: Motion, signals: Sequence[np.ndarray]) -> np.ndarray:

@@ -29,6 +29,8 @@ from ident.torque_fit import (
     make_weights,
     noise_costs,
     predictions,
+    stepped,
+    weighted_cost,
 )
 
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain where the baseline is hopeless
@@ -223,12 +225,11 @@ def explore(
     answered = bool(scores) and scores[0].gain >= least * excess
 
     def started(score: Score) -> Fit | None:
-        model = replace(stage.model, effects=extended_by(stage.model.effects, score))
         # Where the data are followed, a start that has lost them was a step that is not linear. A hinge that stands
-        # anywhere begins off them.
-        followed = stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options
+        # anywhere begins off them, and what answers best is tried from anywhere.
+        followed = stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options and score is not scores[0]
         most = STRONG * stage.count if followed else np.inf
-        return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most)
+        return refit(problem, begin(problem, stage, score), stage.weights, stage.remainders, FIRST_STEPS, most)
 
     def finished(result: Fit) -> Fit:
         return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
@@ -248,6 +249,26 @@ def explore(
         last = workers.map(finished, [r for _, r in found])
         found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores
+
+
+def begin(problem: Problem, stage: Fit, score: Score) -> Model:
+    """The model with a screened hypothesis, what is fitted already as it is or after the step that goes with it: whichever costs less.
+
+    Where drives have taken the place of a cause, as a stiffer gear takes that of one that yields late, the cause beside them
+    as they are is far from the data.
+    """
+    models = [stage.model] if score.step is None else [stage.model, stepped(problem, stage.model, score.step)]
+    models = [replace(m, effects=extended_by(m.effects, score)) for m in models]
+
+    def cost(model: Model) -> float:
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # of a model that cannot be computed
+                found = weighted_cost(problem, predictions(problem, model, stage.remainders), stage.weights)
+        except NOT_COMPUTED:
+            return np.inf
+        return found if np.isfinite(found) else np.inf
+
+    return min(models, key=cost) if len(models) > 1 else models[0]
 
 
 def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
@@ -354,7 +375,10 @@ def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Seq
     """
     middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).highest_line
     hinges = [s for s in scores if "hinge" in s.hypothesis.options]
-    return [replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO)) for s in hinges]
+    return [
+        replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO), step=None)
+        for s in hinges
+    ]
 
 
 def beside_strong(

@@ -301,6 +301,13 @@ def unpack(model: Model, x: np.ndarray, limit: float) -> Model:
     return Model(model.structure, par, tuple(effects))
 
 
+def stepped(problem: Problem, model: Model, step: np.ndarray) -> Model:
+    """The model after a step (p,) of its fitted coordinates, no longer than one of a fit."""
+    m = len(model.par.to_log())
+    step = np.concatenate([np.clip(step[:m], -1.0, 1.0), step[m : m + 1], _clip_effects(model, step[m + 1 :])])
+    return unpack(model, pack(model) + step, TIMING_LIMIT * problem.sampling.sample_time)
+
+
 def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction, *, exact: bool = False) -> Columns:
     """Derivative of the predicted outputs by the fitted coordinates, at the lines that are compared.
 
@@ -520,7 +527,7 @@ def fit(
     """
     limit = TIMING_LIMIT * problem.sampling.sample_time
     m = len(model.par.to_log())
-    center, prior = _prior(problem, model)
+    center, prior = prior_of(problem, model)
     Ws = list(remainders) if remainders is not None else [None] * len(problem.groups)
     count = data_count(problem)
     prior[:m] += hold * count
@@ -636,7 +643,7 @@ def _moves_links(model: Model) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _prior(problem: Problem, model: Model) -> tuple[np.ndarray, np.ndarray]:
+def prior_of(problem: Problem, model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Centre and weight (inverse variance) of the weak prior of each fitted coordinate."""
     ps = [q for effect in model.effects for q in effect.hypothesis.parameters]
     baseline = problem.nominal.to_log()

@@ -46,9 +46,12 @@ def backlash(joint: int, place: str) -> Hypothesis:
             delta = motion.delta(j)
             carried = -0.5 * k * np.sign(delta).mean(axis=1, keepdims=True)
             return Screen((np.broadcast_to(carried, delta.shape),), lambda c: np.array([c[0]]) if c[0] > 0.0 else None, shape)
-        signal = -k * np.clip(motion.delta(j), -0.5 * shape[0], 0.5 * shape[0])
+        delta = motion.delta(j)
+        signal = -k * np.clip(delta, -0.5 * shape[0], 0.5 * shape[0])
+        # As long as the gear stays on its flanks the response grows with the gap; beyond, a linear step is not followed far.
+        most = max(3.0 * shape[0], 2.0 * np.abs(delta).min())
         return Screen(
-            (signal,), lambda c: np.array([shape[0] * np.clip(c[0], 0.3, 3.0)]) if c[0] > 0.1 else None, shape
+            (signal,), lambda c: np.array([np.clip(c[0] * shape[0], 0.3 * shape[0], most)]) if c[0] > 0.1 else None, shape
         )
 
     return Hypothesis(
