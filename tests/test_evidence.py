@@ -31,6 +31,7 @@ from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import hinge_inertia
+from ident.inverse import REMAINDER_STEPS
 from ident.parallel import Workers
 from ident.reporting import frf_views
 from ident.screening import (
@@ -48,6 +49,7 @@ from ident.screening import (
 from ident.search import (
     PER_EFFECT,
     STRONG,
+    begin,
     beside_strong,
     choose,
     explore,
@@ -65,6 +67,7 @@ from ident.torque_fit import (
     RIDGE,
     Weights,
     data_counts,
+    fit,
     inverse,
     joint_costs,
     make_weights,
@@ -279,6 +282,27 @@ def test_a_dead_band_is_screened_where_gravity_has_led_the_gear_through_it(ident
     bands = [x for x in named.values() if x.effect == "backlash"]
     first, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), bands)
     assert first.hypothesis is h and first.start == pytest.approx([gap], rel=0.1)
+
+
+def test_a_cause_begins_beside_the_drives_that_have_taken_its_place(identified, named):
+    """A gear that hardly yields looks like a stiffer one: with the cause beside that, the gear would be stiff twice."""
+    _, setup, result = identified
+    problem, h, j = setup.problem, named["hysteresis", "wrist_1_joint"], 3
+    par, extra = result.model.par, 0.3 * result.model.par.stiffness[3]
+    softer = replace(par, stiffness=par.stiffness - extra * (np.arange(6) == j))
+    truth = replace(result.model, par=softer, effects=(Effect(h, np.array([extra, 0.8, 20.0, 0.0])),))
+    preds = (predictions(problem, m, result.remainders, steps=REMAINDER_STEPS) for m in (result.model, truth))
+    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, *preds, strict=True)]
+    problem = replace(problem, groups=tuple(changed))
+    moved = fit(problem, result.model)  # the drives take up what they can
+    score, *_ = screen(problem, moved, predictions(problem, moved.model, moved.remainders), [h])
+    costs = [
+        weighted_cost(problem, predictions(problem, begin(problem, moved, s), moved.remainders), moved.weights)
+        for s in (score, replace(score, step=None))
+    ]
+    assert costs[0] < 0.05 * costs[1]
+    (found, candidate), *_ = explore(problem, moved, [h], 0.0, np.inf, Workers())[0]
+    assert found is h and candidate.chi2_per_dof < 1.05
 
 
 def test_a_hinge_far_above_the_band_is_screened_where_it_is(identified):
