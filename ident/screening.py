@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.extended import Prediction
-from ident.graybox import linearise
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
 from ident.parallel import map_threads
+from ident.posture import moved_by_gears
 from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error, prior_of
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
@@ -26,7 +26,6 @@ WAVES_AT_ONCE = 260
 FEWEST = 20  # samples in which a wave must lie in the compared band
 FOLLOWED = 0.1  # share of the path of a motion along which a ripple must, for its wave number to be looked for
 REFINED_SAMPLES = 3000  # that wave numbers are refined with
-MOVED = 1e-3  # rad, by which the arm is put elsewhere to see what its posture does
 
 
 @dataclass(frozen=True)
@@ -122,12 +121,10 @@ class _Stage:
     def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
         def whitened(g: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
             group, pred = problem.groups[g], predictions[g]
-            J = fit.weights.apply(g, group.observe_outputs(jacobian(problem, fit.model, group, pred).dense()))
+            J = fit.weights.apply(g, group.observe_outputs(jacobian(problem, fit.model, group, pred, shifts=True).dense()))
             moved = None
             if group.window is None:
                 moved = fit.weights.apply(g, group.observe_outputs(moved_by_gears(pred)))
-                sag = pred.par.stiffness * pred.solution.delta[:, 0].real
-                J[..., : problem.structure.n] += moved * sag[:, None, None, :]
             return fit.weights.apply(g, output_error(group, pred)), J, moved
 
         residuals, columns, moved = zip(*map_threads(whitened, range(len(problem.groups))), strict=True)
@@ -288,29 +285,6 @@ def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:
         return plane.output_per_position[:, :, joint]
     lines, outputs, _ = plane.output_per_motor.shape
     return np.broadcast_to(np.eye(outputs, dtype=complex)[joint], (lines, outputs))
-
-
-def moved_by_gears(pred: Prediction) -> np.ndarray:
-    """What a constant torque of 1 N m in a gear does to the outputs by the posture to which it moves the arm.
-
-    A gear that gives a little under the weight of the arm hardly changes the torque that holds it up, and all that the arm
-    does elsewhere: its inertia there is another. By differences of the arm linearised at rest.
-
-    Returns:
-        (S, L, n + M, joints) outputs per N m, beyond those of the linear arm.
-    """
-    plane, here = pred.plane, pred.plane.lin
-    motion = pred.solution.Q_a.copy()
-    motion[:, 0] -= here.q
-    s = plane.s[:, None, None]
-    out = []
-    for column in pred.structure.driven:
-        way = plane.A_inv[0, :, column].real
-        step = MOVED / np.abs(way).max()
-        there = linearise(pred.structure, here.q + step * way)
-        change = (s**2 * (there.M - here.M) + (there.Kg - here.Kg)) / step
-        out.append(np.matmul(plane.output_per_load @ change, motion[..., None])[..., 0])
-    return np.stack(out, axis=-1)
 
 
 def _share_of_gears(pred: Prediction, channel: str, joint: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from ident.graybox import Parameters, Structure, parameter_names
 from ident.inverse import REMAINDER_STEPS, Motion, Sampling, Torques, baseline_products
 from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
+from ident.posture import moved_by_posture
 from ident.records import Group
 
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
@@ -49,6 +51,7 @@ LEAK = 0.03  # of the largest share of that noise, that is in any direction too
 LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
 SHORTER = 64.0  # factor on the damping of steps then
 SLIGHT = 2.0  # fall of the cost that tells nothing
+SHIFTS = "spring", "link", "position"  # channels of effects that move the arm to another posture
 FORETOLD = 0.1  # error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
 
 
@@ -308,16 +311,20 @@ def stepped(problem: Problem, model: Model, step: np.ndarray) -> Model:
     return unpack(model, pack(model) + step, TIMING_LIMIT * problem.sampling.sample_time)
 
 
-def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction, *, exact: bool = False) -> Columns:
+def jacobian(
+    problem: Problem, model: Model, group: Group, pred: Prediction, *, exact: bool = False, shifts: bool = False
+) -> Columns:
     """Derivative of the predicted outputs by the fitted coordinates, at the lines that are compared.
 
     Args:
         exact: what moves the links moves the torques of all laws of the gears and the geometric remainder. Both are held
             without, which beside such laws ends short of the minimum, and tells of less spread than there is.
+        shifts: what moves the arm to another posture moves all lines, to first order, where the remainder is held.
     """
     m = len(model.par.to_log())
     top = compared_lines(group)
     now = _again(problem, model, group, pred, 1) if exact else pred
+    posture = moved_by_posture(pred)[:, :top] if shifts and not exact and group.window is None else None
     n, n_e = model.structure.n, len(model.structure.elastic)
     extra = len(pred.structure.elastic) - n_e
     keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
@@ -325,14 +332,16 @@ def jacobian(problem: Problem, model: Model, group: Group, pred: Prediction, *, 
     late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
     late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
     baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
+    if posture is not None:
+        baseline = baseline.replaced(_sagging(baseline, pred, posture))
     baseline = baseline.replaced(_passed_on(baseline, model, group, pred))
-    baseline = baseline.replaced(_differences(problem, model, group, pred, now, exact))
+    baseline = baseline.replaced(_differences(problem, model, group, pred, now, exact, posture))
     if not problem.free_timing:
         baseline.whole[..., baseline.whole_at == m] = 0.0
     effects = [
-        column[:, :top]
+        column
         for i in range(len(model.effects))
-        for column in _effect_columns(problem, model, group, pred, now, i, exact)
+        for column in _effect_columns(problem, model, group, pred, now, i, exact, posture)
     ]
     return baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
 
@@ -342,8 +351,34 @@ def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps
     return predict(model, group, problem.sampling, W=pred.solution.W, steps=steps, torques=pred.solution.torques)
 
 
+def _sagging(columns: Columns, pred: Prediction, posture: np.ndarray) -> dict[int, np.ndarray]:
+    """Columns of the stiffness of gears that also let the arm sag to another posture."""
+    sag = pred.plane.A_inv[0][:, pred.structure.driven].real * (pred.par.stiffness * pred.solution.delta[:, 0].real)[:, None]
+    held = columns.products.pick(np.arange(sag.shape[-1])).dense()[:, : posture.shape[1]]
+    return dict(enumerate(np.moveaxis(held + posture @ sag[:, None], -1, 0)))
+
+
+def _change(group: Group, there: Prediction, base: Prediction, posture: np.ndarray | None) -> np.ndarray:
+    """(S, K, n + M) change of the compared outputs between predictions with one geometric remainder.
+
+    Args:
+        posture: of ``moved_by_posture`` at the compared lines, which stands for what the remainder would do; None holds it.
+    """
+    change = (there.outputs(group) - base.outputs(group))[:, : compared_lines(group)]
+    if posture is None:
+        return change
+    shift = (there.solution.Q_a[:, 0] - base.solution.Q_a[:, 0]).real
+    return change + np.einsum("slon,sn->slo", posture, shift)
+
+
 def _differences(
-    problem: Problem, model: Model, group: Group, pred: Prediction, now: Prediction, exact: bool
+    problem: Problem,
+    model: Model,
+    group: Group,
+    pred: Prediction,
+    now: Prediction,
+    exact: bool,
+    posture: np.ndarray | None,
 ) -> dict[int, np.ndarray]:
     """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` the links, by differences from ``now``.
 
@@ -358,12 +393,11 @@ def _differences(
         steps |= dict.fromkeys(np.flatnonzero(_moves_links(model)[:m]).tolist(), BASELINE_STEP)
     if along:
         steps[m] = TIMING_STEP
-    x, top = pack(model), compared_lines(group)
+    x = pack(model)
 
     def column(c: int, step: float) -> np.ndarray:
         there = unpack(model, x + step * (np.arange(len(x)) == c), np.inf)
-        change = _again(problem, there, group, pred, int(exact)).outputs(group) - now.outputs(group)
-        return change[:, :top] / step
+        return _change(group, _again(problem, there, group, pred, int(exact)), now, posture) / step
 
     return {c: column(c, step) for c, step in steps.items()}
 
@@ -400,9 +434,16 @@ def compared_lines(group: Group) -> int:
 
 
 def _effect_columns(
-    problem: Problem, model: Model, group: Group, pred: Prediction, now: Prediction, i: int, exact: bool
+    problem: Problem,
+    model: Model,
+    group: Group,
+    pred: Prediction,
+    now: Prediction,
+    i: int,
+    exact: bool,
+    posture: np.ndarray | None,
 ) -> list[np.ndarray]:
-    """Derivatives (S, L, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences from ``now``."""
+    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences from ``now``."""
     effect = model.effects[i]
     h, steps = effect.hypothesis, []
     for c, q in enumerate(h.parameters):
@@ -412,21 +453,22 @@ def _effect_columns(
             step = -step
             p[c] = q.to_external(x + step)
         steps.append((p, step))
+    top = compared_lines(group)
     if h.channel == "motor" and not joints_along_record(model, group):
-        return _motor_columns(model, group, pred, effect, steps)
+        return [column[:, :top] for column in _motor_columns(model, group, pred, effect, steps)]
     if h.channel == "drive":
-        return _drive_columns(model, group, pred, effect, steps)
+        return [column[:, :top] for column in _drive_columns(model, group, pred, effect, steps)]
     models = [
         Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
         for p, _ in steps
     ]
     if exact or h.channel == "model":
-        base = now if exact else _again(problem, model, group, pred, 1)
+        base, posture = now if exact else _again(problem, model, group, pred, 1), None
         moved = [_again(problem, m, group, pred, 1) for m in models]
     else:
         base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}
         moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
-    return [(there.outputs(group) - base.outputs(group)) / step for there, (_, step) in zip(moved, steps, strict=True)]
+    return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]
 
 
 def _motor_columns(
@@ -543,8 +585,8 @@ def fit(
     if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
-    # The remainder holds the gravity torque of the chain: a chain that changes needs a new one.
-    new_chain = any(e.hypothesis.channel == "model" for e in model.effects)
+    # The remainder holds the gravity torque of the chain, at one posture: what changes either needs a new one.
+    anew = _shifts_posture(model) or any(e.hypothesis.channel == "model" for e in model.effects)
     moves, drift = _moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False
@@ -570,7 +612,7 @@ def fit(
                 if not np.all(np.isfinite(step)):
                     raise FloatingPointError("a step without a size")
                 trial = unpack(model, x + step, limit)
-                new = predictions(problem, trial, Ws, steps=REMAINDER_STEPS if new_chain or fine else 0, near=preds)
+                new = predictions(problem, trial, Ws, steps=REMAINDER_STEPS if anew or fine else 0, near=preds)
                 new_cost = weighted_cost(problem, new, weights)
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                 new_cost = np.inf
@@ -631,6 +673,11 @@ def _settled(problem: Problem, last: Settled, model: Model, weights: Weights) ->
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return last
     return (model, preds, [p.solution.W for p in preds], cost) if cost < LOST * last[3] else last
+
+
+def _shifts_posture(model: Model) -> bool:
+    """Whether effects move the arm to another posture."""
+    return any(e.hypothesis.channel in SHIFTS for e in model.effects)
 
 
 def _moves_links(model: Model) -> np.ndarray:
@@ -719,7 +766,8 @@ def _by_joint(problem: Problem, each: Sequence[np.ndarray]) -> np.ndarray:
 
 def _jacobians(problem: Problem, model: Model, preds: Sequence[Prediction], *, exact: bool) -> list[Columns]:
     """``jacobian`` of all groups."""
-    return map_threads(lambda x: jacobian(problem, model, *x, exact=exact), zip(problem.groups, preds, strict=True))
+    of = partial(jacobian, problem, model, exact=exact, shifts=_shifts_posture(model))
+    return map_threads(lambda x: of(*x), zip(problem.groups, preds, strict=True))
 
 
 def _normal(

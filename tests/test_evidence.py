@@ -33,6 +33,7 @@ from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import hinge_inertia
 from ident.inverse import REMAINDER_STEPS
 from ident.parallel import Workers
+from ident.posture import moved_by_gears
 from ident.reporting import frf_views
 from ident.screening import (
     Score,
@@ -43,7 +44,6 @@ from ident.screening import (
     _share_of_gears,
     _Stage,
     _whole_sums,
-    moved_by_gears,
     screen,
 )
 from ident.search import (
