@@ -251,16 +251,20 @@ def _cause(
             others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
     parameters = reported_parameters(effect, final, covariance)
     numbers = {k: v.value for k, v in parameters.items()}
+    joints = h.options.get("joints", ())
     return Cause(
         effect=h.effect,
         joint=h.place,
         parameters=parameters,
         probability=float(np.clip(own * trust, 0.0, 0.999)),
-        evidence=text_at(h.sentence, at_linear_joint(effect, final.model.structure)).format(joint=h.place, **numbers),
+        evidence=text_at(h.sentence, at_linear_joint(effect, final.model.structure)).format(
+            joint=h.place, turned=joints[-1] if joints else "", **numbers
+        ),
         alternatives=tuple(
             Alternative(e, p, float(v * trust)) for (e, p), v in sorted(others.items(), key=lambda x: -x[1])
         ),
         channel="q" if h.channel == "position" else None,
+        joints=joints,
     )
 
 

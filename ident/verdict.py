@@ -39,7 +39,8 @@ class Alternative:
 class Cause:
     """A named effect at a place ("flange" and "base" are places too).
 
-    ``channel``: "q" or "q_link" for effects of a position channel, else None.
+    ``channel``: "q" or "q_link" for effects of a position channel, else None. ``joints``: both joints of an effect
+    between two, the turning one, which is ``joint``, first; else none.
     """
 
     effect: str
@@ -49,6 +50,7 @@ class Cause:
     evidence: str
     alternatives: tuple[Alternative, ...]
     channel: str | None = None
+    joints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

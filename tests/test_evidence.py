@@ -23,7 +23,7 @@ from ident.attribute import (
     without_shadows,
 )
 from ident.baseline import astray
-from ident.conclude import conclude, faint_note
+from ident.conclude import _cause, conclude, faint_note
 from ident.diagnosis import diagnose, harmful, identify
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
 from ident.extended import Effect, along_record
@@ -769,3 +769,12 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
     loud = replace(baseline, costs=10.0 * baseline.counts)
     beside_strong(setup.problem, loud, [(backlash, replace(loud, costs=5.0 * baseline.counts))], [], Workers())
     assert tried == joints
+
+
+def test_the_cause_between_two_joints_names_both(identified, named):
+    _, setup, result = identified
+    coupled = replace(result.model, effects=(Effect(named["joint_coupling", "wrist_1_joint"], np.array([0.01])),))
+    final = refit(setup.problem, coupled, result.weights, result.remainders, 1)
+    cause = _cause(final.model.effects[0], [], final, final.covariance(), 1.0)
+    assert cause.joint == "wrist_1_joint" and cause.joints == ("wrist_1_joint", "wrist_2_joint")
+    assert "wrist_1_joint turns wrist_2_joint too" in cause.evidence

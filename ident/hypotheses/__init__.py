@@ -56,7 +56,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         if robot.joints[j].gear_ratio != 1.0:
             out.append(sensing.encoder_eccentricity(j, name, robot.joints[j].gear_ratio))
     for j in range(len(names) - 1):
-        out.append(structure.joint_coupling(j, j + 1, names[j]))
+        out.append(structure.joint_coupling(j, j + 1, names[j], names[j + 1]))
     if robot.payload_link in chain.bodies:
         out.append(structure.payload(robot.payload_link))
     seen: set[int] = set()

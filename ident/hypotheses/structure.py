@@ -263,16 +263,16 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False) -> Hyp
     )
 
 
-def joint_coupling(source: int, target: int, place: str) -> Hypothesis:
-    """Turning motor ``source`` turns joint ``target`` too, by ``ratio``."""
+def joint_coupling(source: int, target: int, place: str, turned: str) -> Hypothesis:
+    """Turning motor ``source``, at ``place``, turns joint ``target`` too, by ``ratio``; ``turned`` is that one's name."""
 
     def responses(structure, par, plane, group, solution, shape):
         step = 1e-4
         coupling = par.coupling.copy()
         coupling[target, source] += step
-        turned = replace(par, coupling=coupling)
-        wide = plane_at(structure, turned, plane.lin, group, plane.record)
-        moved = solve(structure, turned, wide, group, None, Q=solution.Q, W=solution.W)
+        coupled = replace(par, coupling=coupling)
+        wide = plane_at(structure, coupled, plane.lin, group, plane.record)
+        moved = solve(structure, coupled, wide, group, None, Q=solution.Q, W=solution.W)
         still = solve(structure, par, plane, group, None, Q=solution.Q, W=solution.W)
         seen = structure.driven[list(group.links)]
         return [np.concatenate([moved.U - still.U, (moved.Q_a - still.Q_a)[..., seen]], axis=-1) / step]
@@ -286,9 +286,10 @@ def joint_coupling(source: int, target: int, place: str) -> Hypothesis:
         None,
         lambda scale: [()],
         None,
-        "Turning the motor of {joint} turns the next joint too, by a ratio of {ratio:.4g}.",
+        "Turning the motor of {joint} turns {turned} too, by a ratio of {ratio:.4g}.",
         variable="q",
         options={
+            "joints": (place, turned),
             "change": lambda p: Change(coupling=((target, source, float(p[0])),)),
             "responses": responses,
             "start": lambda c: np.array([np.clip(c[0], -1.5, 1.5)]),
