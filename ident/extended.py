@@ -96,13 +96,25 @@ class Prediction:
         """(L, n, n) recorded torque per motor position for small changes about the motion.
 
         What noise on the position becomes in the torque residual. Gears count with their
-        equivalent stiffness: a hardening gear passes on more noise than a linear one.
+        equivalent stiffness: a hardening gear passes on more noise than a linear one. With filters of drives and sensors.
         """
         Z = self.plane.Z
         if np.any(self.added_stiffness):
             stiffness = np.maximum(self.par.stiffness + self.added_stiffness, 0.05 * self.par.stiffness)
             Z = impedance(self.structure, replace(self.par, stiffness=stiffness), self.plane.lin, self.plane.s)[0]
-        return self.plane.record[:, None, None] * Z
+        Z = self.plane.record[:, None, None] * Z
+        recorded, true = self.filters
+        return recorded[:, :, None] * Z * true[:, None, :]
+
+    @cached_property
+    def filters(self) -> tuple[np.ndarray, np.ndarray]:
+        """What linear drives record per torque that they deliver, and the true position per measured one; (L, n) each."""
+        recorded, true = np.ones((2, len(self.plane.s), self.structure.n), complex)
+        for effect in self.model.effects:
+            h = effect.hypothesis
+            if "filter" in h.options:
+                (recorded if h.channel == "drive" else true)[:, h.joint] *= h.options["filter"](effect.p, self.plane.s)
+        return recorded, true
 
     def law_noise(self, group: Group) -> np.ndarray:
         """(L, n) power that the error of the motion shown to laws at the motors leaves in the torque, N2 m2.

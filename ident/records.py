@@ -93,6 +93,22 @@ class Group:
         return self.U if not self.links else np.concatenate([self.U, self.Q_link[..., list(self.links)]], axis=-1)
 
     @cached_property
+    def scatter(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Covariances (K, n, n) of torque, of torque and position, and of position, of noise of the means; sums over records.
+
+        By the scatter between periods; None where there is one period, and beside link encoders.
+        """
+        periods = self.U_periods.shape[1]
+        if periods < 2 or self.links:
+            return None
+        U, Q = (
+            (x - x.mean(axis=1, keepdims=True))[:, :, : self.n_compared].transpose(2, 3, 0, 1).reshape(self.n_compared, x.shape[-1], -1)
+            for x in (self.U_periods, self.Q_periods)
+        )
+        scale = periods * (periods - 1)
+        return tuple(a @ b.conj().swapaxes(1, 2) / scale for a, b in ((U, U), (U, Q), (Q, Q)))
+
+    @cached_property
     def position_noise(self) -> np.ndarray:
         """(L, n) variance of a line of the mean position, rad2.
 

@@ -17,7 +17,8 @@ from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
 from ident.parallel import map_threads
 from ident.posture import moved_by_gears
-from ident.torque_fit import Fit, Problem, as_real, jacobian, output_error, prior_of
+from ident.torque_fit import RIDGE, Fit, Problem, as_real, jacobian, output_error, prior_of
+from ident.torque_fit import inverse as steadied_inverse
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
@@ -134,8 +135,9 @@ class _Stage:
         size = np.sqrt(np.maximum(np.diag(H), 1e-30))
         inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-10, hermitian=True) / np.outer(size, size)
         _, prior = prior_of(problem, fit.model)
+        damped = steadied_inverse(H + np.diag(prior), RIDGE)
         motions = tuple(pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True))
-        return cls(problem, fit, predictions, motions, residuals, columns, moved, inverse, moment, np.linalg.inv(H + np.diag(prior)))
+        return cls(problem, fit, predictions, motions, residuals, columns, moved, inverse, moment, damped)
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,21 @@ the plain weighted criterion would stop in wrong minima.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from ident.columns import Columns
+from ident.columns import Columns, Products
+from ident.errors_in_variables import (
+    impedance_slopes,
+    information_left,
+    scatter_costs,
+    scatter_information,
+    scatter_slope,
+    trusted_share,
+)
 from ident.extended import (
     Effect,
     Model,
@@ -108,7 +116,8 @@ class Fit:
         model: chain, parameters and effects at the minimum.
         costs: (n,) whitened sum of squares by joint, prior excluded.
         counts: (n,) real data that entered.
-        information: (p, p) normal matrix of the fitted coordinates, prior excluded.
+        information: (p, p) of the data on the fitted coordinates, prior excluded; their normal matrix where the noise of the
+            position counts for nothing.
         names: of the fitted coordinates.
         remainders: geometric remainder per group, for warm starts.
         weights: under which it was made.
@@ -325,10 +334,7 @@ def jacobian(
     top = compared_lines(group)
     now = _again(problem, model, group, pred, 1) if exact else pred
     posture = moved_by_posture(pred)[:, :top] if shifts and not exact and group.window is None else None
-    n, n_e = model.structure.n, len(model.structure.elastic)
-    extra = len(pred.structure.elastic) - n_e
-    keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
-    base = baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
+    n, base = model.structure.n, _baseline(model, pred, top)
     late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
     late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
     baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
@@ -344,6 +350,14 @@ def jacobian(
         for column in _effect_columns(problem, model, group, pred, now, i, exact, posture)
     ]
     return baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
+
+
+def _baseline(model: Model, pred: Prediction, top: int) -> Products:
+    """Derivatives by the log-parameters of the model, without those of hinges that its effects add."""
+    n, n_e = model.structure.n, len(model.structure.elastic)
+    extra = len(pred.structure.elastic) - n_e
+    keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
+    return baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
 
 
 def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps: int) -> Prediction:
@@ -445,15 +459,7 @@ def _effect_columns(
 ) -> list[np.ndarray]:
     """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences from ``now``."""
     effect = model.effects[i]
-    h, steps = effect.hypothesis, []
-    for c, q in enumerate(h.parameters):
-        x, p, step = q.to_internal(effect.p[c]), effect.p.copy(), q.step
-        p[c] = q.to_external(x + step)
-        if p[c] == effect.p[c]:
-            step = -step
-            p[c] = q.to_external(x + step)
-        steps.append((p, step))
-    top = compared_lines(group)
+    h, steps, top = effect.hypothesis, _steps(effect), compared_lines(group)
     if h.channel == "motor" and not joints_along_record(model, group):
         return [column[:, :top] for column in _motor_columns(model, group, pred, effect, steps)]
     if h.channel == "drive":
@@ -469,6 +475,19 @@ def _effect_columns(
         base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}
         moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
     return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]
+
+
+def _steps(effect: Effect) -> list[tuple[np.ndarray, float]]:
+    """Parameters of an effect after a step of each of its coordinates, and the step."""
+    steps = []
+    for c, q in enumerate(effect.hypothesis.parameters):
+        x, p, step = q.to_internal(effect.p[c]), effect.p.copy(), q.step
+        p[c] = q.to_external(x + step)
+        if p[c] == effect.p[c]:
+            step = -step
+            p[c] = q.to_external(x + step)
+        steps.append((p, step))
+    return steps
 
 
 def _motor_columns(
@@ -582,6 +601,7 @@ def fit(
     if np.isfinite(most) and not cost <= most:
         raise FloatingPointError(f"a start that costs {cost:.3g}, more than {most:.3g}")
     settled = model, preds, Ws, cost
+    share: float | None = None if has_scatter(problem, model) else 0.0  # of what noise adds to the cost, that is taken off
     if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
@@ -600,6 +620,11 @@ def fit(
         columns = columns or _jacobians(problem, model, preds, exact=fine)
         H, b = _normal(problem, columns, preds, weights)
         off = x - center
+        if share is None:
+            share = trusted_share(H, shared_information(problem, model, preds, weights))
+        if share:
+            b = b - share * shared_slope(problem, model, preds, weights)
+        by_noise = share * scatter_cost(problem, preds, weights) if share else 0.0
         H_p, b_p = H + np.diag(prior), b - prior * off
         size = np.diag(H_p).copy()
         size[size <= 0] = 1.0
@@ -614,11 +639,13 @@ def fit(
                 trial = unpack(model, x + step, limit)
                 new = predictions(problem, trial, Ws, steps=REMAINDER_STEPS if anew or fine else 0, near=preds)
                 new_cost = weighted_cost(problem, new, weights)
+                new_noise = share * scatter_cost(problem, new, weights) if share else 0.0
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-                new_cost = np.inf
+                new_cost = new_noise = np.inf
+            gain = (cost - by_noise) - (new_cost - new_noise) if np.isfinite(new_cost) else -np.inf
             penalty = np.sum(prior * ((off + step) ** 2 - off**2))
             foretold = float(2.0 * b @ step - step @ H @ step)
-            improved = bool(np.isfinite(new_cost) and new_cost + penalty < cost)
+            improved = bool(gain > penalty)
             if improved or (slow and foretold < SLIGHT):
                 break
             damping = max(damping, 1e-4) * 8
@@ -628,7 +655,6 @@ def fit(
                 break
             fine, damping, columns = fine if not fresh else True, 1e-3, []
             continue
-        gain = cost - new_cost
         if not (slow and abs(gain - foretold) <= max(FORETOLD * foretold, SLIGHT)):
             columns = []
         drift += np.abs(pack(trial) - x)
@@ -654,6 +680,8 @@ def fit(
     if fine != exact or not columns:
         columns = _jacobians(problem, model, preds, exact=exact)
     H, _ = _normal(problem, columns, preds, weights)
+    if share:
+        H = information_left(H, share * shared_information(problem, model, preds, weights))
     return Fit(model, joint_costs(problem, preds, weights), data_counts(problem), H, coordinate_names(model), tuple(Ws), weights, converged)
 
 
@@ -784,6 +812,44 @@ def _normal(
 
     H, b = zip(*map_threads(of_group, range(len(problem.groups))), strict=True)
     return sum(H), sum(b)
+
+
+def has_scatter(problem: Problem, model: Model) -> bool:
+    """Whether the scatter between periods tells what noise adds to the normal equations; along the record it does not."""
+    return all(g.scatter is not None and not joints_along_record(model, g) for g in problem.groups)
+
+
+def scatter_cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
+    """What noise adds to ``weighted_cost`` (``errors_in_variables``)."""
+    each = zip(problem.groups, preds, weights.whiten, strict=True)
+    return float(sum(np.sum(scatter_costs(*of)) for of in each))
+
+
+def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """The same to the right-hand side of ``_normal``."""
+    m, names = len(model.par.to_log()), coordinate_names(model)
+
+    def others(group: Group, pred: Prediction, K: int) -> Iterator[tuple[int, np.ndarray]]:
+        if problem.free_timing:
+            yield m, pred.plane.s[:K, None, None] * pred.sampled_impedance[:K]
+        at = m + 1
+        for i, effect in enumerate(model.effects):
+            slopes = impedance_slopes(model, group, pred, problem.sampling, i, _steps(effect))
+            yield from ((at + c, slope) for c, slope in enumerate(slopes))
+            at += len(effect.p)
+
+    def of_group(of: tuple[Group, Prediction, np.ndarray]) -> np.ndarray:
+        group, pred, whiten = of
+        K = len(whiten)
+        return scatter_slope(group, pred, whiten, _baseline(model, pred, K), others(group, pred, K), len(names))
+
+    return sum(map_threads(of_group, zip(problem.groups, preds, weights.whiten, strict=True)))
+
+
+def shared_information(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """The same to the normal matrix of the baseline parameters."""
+    each = zip(problem.groups, preds, weights.whiten, strict=True)
+    return sum(scatter_information(g, pred, whiten, _baseline(model, pred, len(whiten))) for g, pred, whiten in each)
 
 
 def as_real(X: np.ndarray) -> np.ndarray:

@@ -28,14 +28,15 @@ def torque_constant(joint: int, place: str) -> Hypothesis:
         "The motor of {joint} delivers {scale:.4g} times the torque that is recorded, at every frequency and"
         " in every posture.",
         variable="torque",
+        options={"filter": lambda p, s: np.full(len(s), 1.0 / p[0])},
     )
 
 
 def torque_lag(joint: int, place: str) -> Hypothesis:
     """Current loop as a first-order lag: ``delivered = recorded / (1 + s time_constant)``."""
 
-    def law(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
-        return U * (1.0 + 1j * motion.group.omega * p[0])
+    def lag(p, s: np.ndarray) -> np.ndarray:
+        return 1.0 + s * p[0]
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         return Screen(
@@ -49,20 +50,21 @@ def torque_lag(joint: int, place: str) -> Hypothesis:
         joint,
         "drive",
         (Parameter("time_constant", "s", 1e-7, 1.0, log=True),),
-        law,
+        lambda p, motion, j, k, U: U * lag(p, 1j * motion.group.omega),
         lambda scale: [()],
         screen,
         "The torque of {joint} follows its record as a first-order lag of {time_constant:.3g} s: phase is lost"
         " and gain falls with frequency.",
         variable="torque",
+        options={"filter": lag},
     )
 
 
 def torque_delay(joint: int, place: str) -> Hypothesis:
     """The torque comes ``delay`` after its record."""
 
-    def law(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
-        return U * np.exp(1j * motion.group.omega * p[0])
+    def late(p, s: np.ndarray) -> np.ndarray:
+        return np.exp(s * p[0])
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         return Screen(
@@ -76,11 +78,12 @@ def torque_delay(joint: int, place: str) -> Hypothesis:
         joint,
         "drive",
         (Parameter("delay", "s", 1e-7, 1.0, log=True),),
-        law,
+        lambda p, motion, j, k, U: U * late(p, 1j * motion.group.omega),
         lambda scale: [()],
         screen,
         "The torque of {joint} acts {delay:.3g} s after its record: phase linear in frequency, gain untouched.",
         variable="torque",
+        options={"filter": late},
     )
 
 

@@ -33,6 +33,7 @@ def sensor_delay(joint: int, place: str) -> Hypothesis:
         "The position of {joint} comes {delay:.3g} s late: the phase of one row, linear in frequency, also where"
         " other joints drive it.",
         variable="v",
+        options={"filter": lambda p, s: np.exp(s * p[0])},
     )
 
 
@@ -57,6 +58,7 @@ def sensor_lag(joint: int, place: str) -> Hypothesis:
         "The position of {joint} passes a filter of {time_constant:.3g} s: phase and gain of one row of the FRF"
         " fall with frequency.",
         variable="v",
+        options={"filter": lambda p, s: 1.0 + s * p[0]},
     )
 
 

@@ -1,0 +1,86 @@
+"""Noise of the position, in both factors of the normal equations: taken off exactly, and no further than the data bear."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.diagnosis import set_up
+from ident.errors_in_variables import MOST, information_left, trusted_share
+from ident.extended import Effect, Model
+from ident.hypotheses import catalogue
+from ident.torque_fit import (
+    coordinate_names,
+    fit,
+    make_weights,
+    pack,
+    predictions,
+    scatter_cost,
+    shared_information,
+    shared_slope,
+    unpack,
+)
+from sim import run_experiment
+from sim.experiment import draw_drives
+from tests.conftest import small_plan
+
+STEP = 1e-5
+
+
+@pytest.mark.parametrize("named", [None, ("torque_lag", 1e-3), ("sensor_delay", 1e-3), ("unknown:link_friction", 20.0), ("torque_constant", 1.1)])
+def test_the_slope_of_what_noise_adds_is_its_derivative(identified, named):
+    _, setup, result = identified
+    problem, model = setup.problem, result.model
+    if named:
+        h = next(h for h in catalogue(problem.structure) if (h.effect, h.place) == (named[0], "elbow_joint"))
+        model = replace(model, effects=(Effect(h, np.array([named[1]])),))
+    preds = predictions(problem, model, result.remainders)
+    weights = make_weights(problem, preds, 0.0)
+    slope, x = shared_slope(problem, model, preds, weights), pack(model)
+
+    def cost(step):
+        there = unpack(model, x + step, np.inf)
+        return scatter_cost(problem, predictions(problem, there, result.remainders), weights)
+
+    size = np.ones(len(x))
+    size[coordinate_names(model).index("timing")] = problem.sampling.sample_time
+    each = STEP * np.diag(size)
+    numeric = [(cost(step) - cost(-step)) / (2.0 * STEP) for step in each]
+    assert -2.0 * slope * size == pytest.approx(numeric, rel=5e-3, abs=2e-4 * np.abs(numeric).max())
+
+
+def test_noise_of_the_position_moves_no_parameter(ur10, monkeypatch):
+    """At ten times the noise of the arm errors are as large as their deviations say; of plain least squares, twice that."""
+    drives = draw_drives(np.random.default_rng(6), ur10)
+    problem = set_up(run_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0)).problem
+    names = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
+    truth = replace(problem.nominal, **{mine: drives[its] for mine, its in names.items()})
+
+    def off():
+        found = fit(problem, Model(problem.structure, truth), iterations=40)
+        found = fit(problem, found.model, iterations=40)
+        error = found.model.par.to_log() - truth.to_log()
+        return error / np.sqrt(np.diag(found.covariance()))[: len(error)]
+
+    assert np.sqrt(np.mean(off() ** 2)) < 1.3 and np.abs(off()).max() < 4.0
+    monkeypatch.setattr("ident.torque_fit.has_scatter", lambda *args: False)
+    assert np.sqrt(np.mean(off() ** 2)) > 2.0 and np.abs(off()).max() > 5.0
+
+
+def test_no_more_is_taken_off_than_leaves_information(identified):
+    _, setup, result = identified
+    problem = setup.problem
+    preds = predictions(problem, result.model, result.remainders)
+    by_noise = shared_information(problem, result.model, preds, result.weights)
+    H, q = result.information, len(by_noise)
+    assert trusted_share(H, by_noise) == 1.0
+    for factor in (1e3, 1e6, 1e9):
+        taken = trusted_share(H, factor * by_noise) * factor * by_noise
+        left = H.copy()
+        left[:q, :q] -= taken
+        root = np.linalg.cholesky(H)
+        ratio = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, left).T))
+        assert ratio.min() > 1.0 - MOST - 1e-6
+        kept = information_left(H, taken)
+        assert np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, H - kept).T)).min() > -1e-6
+    assert information_left(H, 0.0 * by_noise) == pytest.approx(H, rel=1e-6, abs=1e-6 * np.abs(H).max())
