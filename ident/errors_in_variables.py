@@ -19,6 +19,7 @@ from ident.inverse import Sampling, make_plane
 from ident.records import Group
 
 MOST = 0.9  # of the information on any direction of the coordinates, that may be taken off as noise
+CERTAINLY_MORE = 1.5  # what noise adds over all that there is, in some direction, that no scatter of its estimate explains
 STEADY = 1e-10  # relative, of a normal matrix of which an inverse is taken
 
 
@@ -69,13 +70,16 @@ def scatter_information(group: Group, pred: Prediction, whiten: np.ndarray, base
 def trusted_share(information: np.ndarray, by_noise: np.ndarray) -> float:
     """Share of what noise adds that is taken off, 1 unless some direction of the coordinates would hold next to nothing then.
 
+    None where there would be more noise in a direction than there is of all: then the periods differ by more than noise, as those of a
+    motor that creeps do.
+
     Args:
         information: normal matrix (p, p); by_noise: what noise adds to its first rows and columns.
     """
     information, by_noise, _ = _scaled(information, by_noise)
     root = np.linalg.cholesky(information)
     largest = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, by_noise).T)).max()
-    return float(min(1.0, MOST / max(largest, 1e-300)))
+    return float(min(1.0, MOST / max(largest, 1e-300))) if largest < CERTAINLY_MORE else 0.0
 
 
 def information_left(information: np.ndarray, by_noise: np.ndarray) -> np.ndarray:

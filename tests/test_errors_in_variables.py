@@ -74,11 +74,15 @@ def test_no_more_is_taken_off_than_leaves_information(identified):
     by_noise = shared_information(problem, result.model, preds, result.weights)
     H, q = result.information, len(by_noise)
     assert trusted_share(H, by_noise) == 1.0
-    for factor in (1e3, 1e6, 1e9):
+    root = np.linalg.cholesky(H)
+    padded = np.zeros_like(H)
+    padded[:q, :q] = by_noise
+    largest = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, padded).T)).max()
+    assert trusted_share(H, 2.0 / largest * by_noise) == 0.0
+    for factor in (0.5 / largest, 1.0 / largest, 1.4 / largest):
         taken = trusted_share(H, factor * by_noise) * factor * by_noise
         left = H.copy()
         left[:q, :q] -= taken
-        root = np.linalg.cholesky(H)
         ratio = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, left).T))
         assert ratio.min() > 1.0 - MOST - 1e-6
         kept = information_left(H, taken)
