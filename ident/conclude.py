@@ -265,6 +265,7 @@ def _cause(
         ),
         channel="q" if h.channel == "position" else None,
         joints=joints,
+        with_load=h.options.get("with_load", False),
     )
 
 

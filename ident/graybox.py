@@ -33,11 +33,13 @@ class LinkChange:
     Attributes:
         mass, inertia: factors, the latter on the inertia about the centre of mass.
         com: (3,) shift of the centre of mass in the frame of the link's joint, m.
+        with_load: whether the loads that the robot names on it are part of it.
     """
 
     mass: float = 1.0
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)
     inertia: float = 1.0
+    with_load: bool = False
 
     def of(self, body: pin.Inertia) -> pin.Inertia:
         """The body with the change made."""
@@ -46,7 +48,7 @@ class LinkChange:
     def __add__(self, other: LinkChange) -> LinkChange:
         """Both changes, one after the other."""
         com = (self.com[0] + other.com[0], self.com[1] + other.com[1], self.com[2] + other.com[2])
-        return LinkChange(self.mass * other.mass, com, self.inertia * other.inertia)
+        return LinkChange(self.mass * other.mass, com, self.inertia * other.inertia, self.with_load or other.with_load)
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,18 @@ INERTIAL = (
 """Inertial parameters of a body in the frame of its joint, in the order of ``pin.Inertia.toDynamicParameters``."""
 
 
+def _placed_loads(robot: Robot, source: pin.Model) -> list[tuple[str, pin.Inertia]]:
+    """Loads that a robot names, each with its link, in the frame of the joint that carries that."""
+    places = {f.name: f.placement for f in source.frames if f.type == pin.FrameType.BODY}
+    for load in robot.loads:
+        if load.link not in places:
+            raise DataError("load", str(robot.folder), load.link, f"a link among {sorted(places)}")
+    return [
+        (load.link, places[load.link].act(pin.Inertia(load.mass, np.asarray(load.com), np.asarray(load.inertia))))
+        for load in robot.loads
+    ]
+
+
 def build_structure(
     robot: Robot,
     *,
@@ -203,6 +217,7 @@ def build_structure(
     parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
     changed = {parent[link]: change for link, change in (links or {}).items()}
     known = inertias or {}
+    placed = _placed_loads(robot, source)
     carrier = {0: _add_hinges(model, 0, [h for h in hinges if h.joint == "base"], pin.SE3.Identity())[0]}
     index: dict[str, int] = {}
     for i in range(1, source.njoints):
@@ -214,23 +229,22 @@ def build_structure(
         k = model.addJoint(below, _joint_model(joint), placement, name)
         index[name] = model.idx_vs[k]
         carrier[i], _ = _add_hinges(model, k, [h for h in own if not h.before], pin.SE3.Identity())
-        body = changed.get(i, LinkChange()).of(known.get(name, source.inertias[i]))
-        model.appendBodyToJoint(carrier[i], body, pin.SE3.Identity())
+        body, change = known.get(name, source.inertias[i]), changed.get(i, LinkChange())
+        if change.with_load and name not in known:
+            body = sum((x for link, x in placed if parent[link] == i), body)
+        model.appendBodyToJoint(carrier[i], change.of(body), pin.SE3.Identity())
     bodies = {
         f.name: (carrier[f.parentJoint], f.placement)
         for f in source.frames
         if f.type == pin.FrameType.BODY
     }
-    own = [
-        (load.link, pin.Inertia(load.mass, np.asarray(load.com), np.asarray(load.inertia)))
-        for load in robot.loads
-    ]
-    for k, (link, inertia) in enumerate([*own, *loads]):
+    for link, inertia in placed:
+        if source.names[parent[link]] not in known and not changed.get(parent[link], LinkChange()).with_load:
+            model.appendBodyToJoint(bodies[link][0], inertia, pin.SE3.Identity())
+    for link, inertia in loads:
         if link not in bodies:
             raise DataError("load", str(robot.folder), link, f"a link among {sorted(bodies)}")
         joint_index, placement = bodies[link]
-        if k < len(own) and source.names[parent[link]] in known:
-            continue
         model.appendBodyToJoint(joint_index, inertia, placement)
     driven = np.array([index[name] for name in robot.joint_names])
     elastic = np.array(

@@ -40,7 +40,8 @@ class Cause:
     """A named effect at a place ("flange" and "base" are places too).
 
     ``channel``: "q" or "q_link" for effects of a position channel, else None. ``joints``: both joints of an effect
-    between two, the turning one, which is ``joint``, first; else none.
+    between two, the turning one, which is ``joint``, first; else none. ``with_load``: of a body, whether the loads that the
+    robot names on it are part of it.
     """
 
     effect: str
@@ -51,6 +52,7 @@ class Cause:
     alternatives: tuple[Alternative, ...]
     channel: str | None = None
     joints: tuple[str, ...] = ()
+    with_load: bool = False
 
 
 @dataclass(frozen=True)

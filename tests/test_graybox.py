@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import scipy.linalg
 
-from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
+from ident.graybox import LinkChange, Parameters, build_structure, equilibrium, linearise, sampled_frf
 from robot_assets.robot import Elasticity, load_robot
 
 Q0 = np.array([0.2, -1.2, 0.9, 0.1, 0.5, 0.3])
@@ -107,3 +108,20 @@ def test_a_hinge_before_a_joint_turns_with_its_carrier(ur10):
     a, b = ([M[h, h] for M, h, _ in runs] for runs in (after, before))
     assert a[0] == pytest.approx(a[1], rel=1e-9)
     assert abs(b[0] / b[1] - 1) > 0.1
+
+
+def test_the_body_of_a_link_is_changed_with_its_load_or_without(ur10):
+    """The ur10's last link carries the load that its robot.toml names."""
+    joint, placement = build_structure(ur10).bodies["wrist_3_link"]
+    load = ur10.loads[0]
+
+    def body(structure):
+        return structure.model.inertias[joint]
+
+    both, bare = body(build_structure(ur10)), body(build_structure(replace(ur10, loads=())))
+    change = LinkChange(0.9, (0.01, 0.0, 0.0), 0.8)
+    whole = body(build_structure(ur10, links={"wrist_3_link": replace(change, with_load=True)}))
+    alone = body(build_structure(ur10, links={"wrist_3_link": change}))
+    assert whole.isApprox(change.of(both), 1e-9)
+    assert alone.isApprox(change.of(bare) + placement.act(pin.Inertia(load.mass, np.array(load.com), np.array(load.inertia))), 1e-9)
+    assert whole.mass == pytest.approx(0.9 * both.mass) and alone.mass == pytest.approx(0.9 * bare.mass + load.mass)

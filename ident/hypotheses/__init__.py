@@ -65,7 +65,9 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
             continue
         seen.add(index)
         carries = index == chain.bodies.get(robot.payload_link, (0, None))[0]
-        out.append(structure.link_inertia(link, _joint_of_body(chain, index), carries))
+        loaded = any(chain.bodies[load.link][0] == index for load in robot.loads)
+        for with_load in (False, True)[: 1 + loaded]:
+            out.append(structure.link_inertia(link, _joint_of_body(chain, index), carries, with_load))
     for j, name in enumerate(names):
         # Before the first joint it would be the base that moves.
         for before in (False, True)[: 1 + (j > 0)]:

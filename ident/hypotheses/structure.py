@@ -210,7 +210,7 @@ def payload(link: str) -> Hypothesis:
     )
 
 
-def link_inertia(link: str, joint_index: int, carries_load: bool = False) -> Hypothesis:
+def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_load: bool = False) -> Hypothesis:
     """Mass, centre of mass and inertia of a link are not those of the model.
 
     ``mass`` and ``inertia`` (about the centre of mass) are factors, ``com`` is a shift in the frame of
@@ -218,14 +218,16 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False) -> Hyp
 
     Args:
         carries_load: whether a payload would be part of the same body.
+        with_load: whether the loads that the robot names on it are.
     """
 
     def how(p) -> LinkChange:
-        return LinkChange(float(p[0]), (float(p[1]), float(p[2]), float(p[3])), float(p[4]))
+        return LinkChange(float(p[0]), (float(p[1]), float(p[2]), float(p[3])), float(p[4]), with_load)
 
     def responses(structure, par, plane, group, solution, shape):
         joint, _ = structure.bodies[link]
-        bare = build_structure(structure.robot, links=structure.links, inertias=structure.inertias)
+        robot = structure.robot if with_load else replace(structure.robot, loads=())
+        bare = build_structure(robot, links=structure.links, inertias=structure.inertias)
         own = bare.model.inertias[bare.bodies[link][0]]
         base = own.toDynamicParameters()
         changed = np.array([1.0, 0.0, 0.0, 0.0, 1.0]) + np.diag(LINK_STEPS)
@@ -247,12 +249,14 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False) -> Hyp
         None,
         lambda scale: [()],
         None,
-        "The body of {joint} is not that of the model: its mass is {mass:.3g} times, its inertia {inertia:.3g} times"
+        f"The body of {{joint}}{', with the load on it,' if with_load else ''} is not that of the model:"
+        " its mass is {mass:.3g} times, its inertia {inertia:.3g} times"
         " what the model says, its centre of mass off by ({com_x:.3g}, {com_y:.3g}, {com_z:.3g}) m.",
         variable="posture",
         options={
             "body": link,
             "nats": -LOAD_NATS if carries_load else 0.0,
+            "with_load": with_load,
             "carries_load": carries_load,  # what it carries and its own body are one to the data
             "change": lambda p: Change(links=((link, how(p)),)),
             "responses": responses,

@@ -142,7 +142,7 @@ def _payload(robot: Robot, cause: Cause) -> tuple[str, pin.Inertia]:
 
 def _link_change(cause: Cause) -> LinkChange:
     p = {k: v.value for k, v in cause.parameters.items()}
-    return LinkChange(p["mass"], (p["com_x"], p["com_y"], p["com_z"]), p["inertia"])
+    return LinkChange(p["mass"], (p["com_x"], p["com_y"], p["com_z"]), p["inertia"], cause.with_load)
 
 
 def _add_bodies(spec: mujoco.MjSpec, model: pin.Model, springs: dict[str, Elasticity]) -> None:
