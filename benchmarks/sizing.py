@@ -21,7 +21,7 @@ CHANNELS = "tau", "q"
 NEIGHBOURS = 9  # lines over which the noise of a line is averaged: few periods tell it poorly
 
 TRIALS = 12  # sizes found out, at most
-NEAR = 0.1  # logarithm of the ratio to the target within which an effect is there
+NEAR = 0.25  # logarithm of the ratio to the target within which an effect is there: the size it has is what is reported
 LONGEST = 4.0  # step of log strength
 LARGEST = float(np.log(30.0))  # log strength: a gear with a gap of degrees is another machine
 EDGE = 0.1  # share of the way between too little and too much, at either end, where no secant is followed
