@@ -242,8 +242,10 @@ def explore(
     found = begun(chosen)
     if not workers.late:
         found += begun(other_bodies(found, chosen, scores))
-    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest.
-    unclear = stage.chi2_per_dof <= FAINT and left_by(found) > (DETECTION_EXCESS - 1.0) * stage.count
+    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; along the record the
+    # law itself leaves that much.
+    along = any(is_along_record(e.hypothesis) for e in stage.model.effects)
+    unclear = stage.chi2_per_dof <= FAINT and not along and left_by(found) > (DETECTION_EXCESS - 1.0) * stage.count
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)

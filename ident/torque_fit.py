@@ -29,6 +29,7 @@ from ident.extended import (
     Prediction,
     beside,
     has_loop,
+    is_along_record,
     joints_along_record,
     predict,
     predict_at,
@@ -704,8 +705,8 @@ def _settled(problem: Problem, last: Settled, model: Model, weights: Weights) ->
 
 
 def _shifts_posture(model: Model) -> bool:
-    """Whether effects move the arm to another posture."""
-    return any(e.hypothesis.channel in SHIFTS for e in model.effects)
+    """Whether effects move the arm to another posture; along the record that says what the gear carries."""
+    return any(e.hypothesis.channel in SHIFTS and not is_along_record(e.hypothesis) for e in model.effects)
 
 
 def _moves_links(model: Model) -> np.ndarray:
