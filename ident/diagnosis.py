@@ -51,7 +51,7 @@ SETTLED_BY_INERTIAS = 0.5  # chi2 per degree of freedom with the links' inertias
 HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
 LEAST_HELD_OUT = 2.0  # s of it
 RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
-MAX_SECONDS = 900.0  # of search for causes
+MAX_SECONDS = 600.0  # of search for causes
 SEED = 0
 
 

@@ -121,3 +121,12 @@ def test_real_data_that_are_not_shipped_are_one_clear_error(tmp_path):
     run = simgap("demo", "--real", "atlantis", "--out", tmp_path / "out")
     assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1
     assert "atlantis" in run.stderr and "twomass" in run.stderr
+
+
+def test_the_search_ends_after_the_same_time_from_the_command_line_and_from_python():
+    import inspect
+
+    from ident.cli import diagnose as command
+    from ident.diagnosis import MAX_SECONDS
+
+    assert inspect.signature(command).parameters["max_seconds"].default == MAX_SECONDS
