@@ -147,7 +147,7 @@ def attribute(
                 break
             p_detected = p_detected if loud or rounds else by_chance
         workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
-        # What is left beside a cause is mostly what its law lacks, and no hinge; what is faint shows none everywhere.
+        # What is left beside a cause is mostly what its law lacks, and no hinge unless little is left; what is faint shows none everywhere.
         bare = np.inf if rounds or faint else worth_a_hinge(current)
         least = 0.0 if faint else worth_a_refit(current)
         quiet = frozenset() if faint else shadows(problem, current, rounds)
@@ -249,7 +249,13 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     winner = found.candidates[0].hypothesis
     others = tuple(e for e in effects if e.hypothesis.key != winner.key)
     own = next(e for e in effects if e.hypothesis.key == winner.key)
-    rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and c.hypothesis.key not in there]
+
+    def other(h: Hypothesis) -> bool:
+        """Whether it is not there already: a body with its load is another one than without."""
+        same = h.key == winner.key and h.options.get("with_load") == own.hypothesis.options.get("with_load")
+        return h.key not in there or (h.key == winner.key and "body" in h.options and not same)
+
+    rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
     rivals = [*rivals[:FINALISTS], *(wider(problem, current, own) if nearly_settled(current) else [])]
 
     def entered(effect: Effect) -> Fit | None:
@@ -269,7 +275,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     weighed = weigh(ran, excess, temper_of(found.before))
     best = weighed[0]
     if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
-        best = next(c for c in weighed if c.hypothesis is own.hypothesis)
+        best = next(c for c in weighed if c.hypothesis.key == own.hypothesis.key)
     elif best.hypothesis is not own.hypothesis:
         current = polish(problem, best.fit)
     now = {c.hypothesis.key: c.probability for c in weighed}

@@ -10,6 +10,7 @@ where the model is right, whatever the weights.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -42,7 +43,8 @@ def scatter_slope(
     """(p,) what it adds to ``J^H e`` of the normal equations, in the order of the coordinates.
 
     Args:
-        baseline: of ``baseline_products``, of the first coordinates; its signals do not matter.
+        baseline: of ``baseline_products``, of the first coordinates; its signals do not matter. Gears beside laws count as linear
+            here, and with their equivalent stiffness in the cost: what that leaves is far below a deviation.
         others: coordinates and the derivatives (K, n, n) of the impedance by them.
         count: coordinates, p.
     """
@@ -70,7 +72,7 @@ def scatter_information(group: Group, pred: Prediction, whiten: np.ndarray, base
 def trusted_share(information: np.ndarray, by_noise: np.ndarray) -> float:
     """Share of what noise adds that is taken off, 1 unless some direction of the coordinates would hold next to nothing then.
 
-    None where there would be more noise in a direction than there is of all: then the periods differ by more than noise, as those of a
+    0 where there would be more noise in a direction than there is of all: then the periods differ by more than noise, as those of a
     motor that creeps do.
 
     Args:
@@ -90,9 +92,9 @@ def information_left(information: np.ndarray, by_noise: np.ndarray) -> np.ndarra
     Args:
         information, by_noise: ``H`` and ``D``, as of ``trusted_share``.
     """
-    information, by_noise, size = _scaled(information, by_noise)
-    left = information - by_noise
-    return left @ np.linalg.solve(information, left) * np.outer(size, size)
+    steadied, by_noise, size = _scaled(information, by_noise)
+    left = information / np.outer(size, size) - by_noise
+    return left @ np.linalg.solve(steadied, left) * np.outer(size, size)
 
 
 def _scaled(information: np.ndarray, by_noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,7 +143,7 @@ def impedance_slopes(
         if h.channel == "model":
             structure, par = there.built()
             plane = make_plane(structure, par, group, sampling)
-        moved = Prediction(there, sampling, structure, par, plane, pred.solution, pred.U, pred.added_stiffness)
+        moved = replace(pred, model=there, structure=structure, par=par, plane=plane)
         yield (moved.sampled_impedance[:K] - pred.sampled_impedance[:K]) / step
 
 

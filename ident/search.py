@@ -227,7 +227,7 @@ def explore(
     def started(score: Score) -> Fit | None:
         # Where the data are followed, a start that has lost them was a step that is not linear. A hinge that stands
         # anywhere begins off them, and what answers best is tried from anywhere.
-        followed = stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options and score is not scores[0]
+        followed = stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options and score.gain < scores[0].gain
         most = STRONG * stage.count if followed else np.inf
         return refit(problem, begin(problem, stage, score), stage.weights, stage.remainders, FIRST_STEPS, most)
 

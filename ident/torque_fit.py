@@ -198,8 +198,11 @@ def output_covariance(problem: Problem, group: Group, prediction: Prediction) ->
     if not links:
         return S
     position = (problem.q_std**2 + np.square(problem.step_std)) / samples
+    recorded, true = prediction.filters
+    per_position = prediction.plane.output_per_position[: len(S)] * true[: len(S), None]
+    per_position[:, :n] *= recorded[: len(S), :, None]
     all_of_it = white_covariance(
-        prediction.plane.output_per_position[: len(S)],
+        per_position,
         np.concatenate([np.zeros(n), group.link_std[links] ** 2 / samples]),
         position,
     )
@@ -369,7 +372,7 @@ def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps
 def _sagging(columns: Columns, pred: Prediction, posture: np.ndarray) -> dict[int, np.ndarray]:
     """Columns of the stiffness of gears that also let the arm sag to another posture."""
     sag = pred.plane.A_inv[0][:, pred.structure.driven].real * (pred.par.stiffness * pred.solution.delta[:, 0].real)[:, None]
-    held = columns.products.pick(np.arange(sag.shape[-1])).dense()[:, : posture.shape[1]]
+    held = columns.products.pick(np.arange(sag.shape[-1])).dense()
     return dict(enumerate(np.moveaxis(held + posture @ sag[:, None], -1, 0)))
 
 
@@ -382,7 +385,8 @@ def _change(group: Group, there: Prediction, base: Prediction, posture: np.ndarr
     change = (there.outputs(group) - base.outputs(group))[:, : compared_lines(group)]
     if posture is None:
         return change
-    shift = (there.solution.Q_a[:, 0] - base.solution.Q_a[:, 0]).real
+    # A plane of its own stands at another posture already.
+    shift = (there.solution.Q_a[:, 0] - base.solution.Q_a[:, 0]).real - (there.plane.lin.q - base.plane.lin.q)
     return change + np.einsum("slon,sn->slo", posture, shift)
 
 
@@ -607,7 +611,7 @@ def fit(
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
     # The remainder holds the gravity torque of the chain, at one posture: what changes either needs a new one.
-    anew = _shifts_posture(model) or any(e.hypothesis.channel == "model" for e in model.effects)
+    anew = (_shifts_posture(model) and not problem.motions_alone) or any(e.hypothesis.channel == "model" for e in model.effects)
     moves, drift = _moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False
@@ -828,7 +832,7 @@ def scatter_cost(problem: Problem, preds: Sequence[Prediction], weights: Weights
 
 def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
     """The same to the right-hand side of ``_normal``."""
-    m, names = len(model.par.to_log()), coordinate_names(model)
+    m, count = len(model.par.to_log()), len(coordinate_names(model))
 
     def others(group: Group, pred: Prediction, K: int) -> Iterator[tuple[int, np.ndarray]]:
         if problem.free_timing:
@@ -842,7 +846,7 @@ def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], we
     def of_group(of: tuple[Group, Prediction, np.ndarray]) -> np.ndarray:
         group, pred, whiten = of
         K = len(whiten)
-        return scatter_slope(group, pred, whiten, _baseline(model, pred, K), others(group, pred, K), len(names))
+        return scatter_slope(group, pred, whiten, _baseline(model, pred, K), others(group, pred, K), count)
 
     return sum(map_threads(of_group, zip(problem.groups, preds, weights.whiten, strict=True)))
 

@@ -9,6 +9,7 @@ from ident.diagnosis import set_up
 from ident.errors_in_variables import MOST, information_left, trusted_share
 from ident.extended import Effect, Model
 from ident.hypotheses import catalogue
+from ident.search import refit
 from ident.torque_fit import (
     coordinate_names,
     fit,
@@ -87,4 +88,13 @@ def test_no_more_is_taken_off_than_leaves_information(identified):
         assert ratio.min() > 1.0 - MOST - 1e-6
         kept = information_left(H, taken)
         assert np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, H - kept).T)).min() > -1e-6
+    unfelt = H * np.outer(np.arange(len(H)) > 0, np.arange(len(H)) > 0)
+    assert not np.any(information_left(unfelt, 0.0 * by_noise)[0])
     assert information_left(H, 0.0 * by_noise) == pytest.approx(H, rel=1e-6, abs=1e-6 * np.abs(H).max())
+
+
+def test_an_effect_that_the_data_do_not_feel_is_no_candidate(identified):
+    _, setup, result = identified
+    h = next(h for h in catalogue(setup.problem.structure) if (h.effect, h.place) == ("torque_saturation", "elbow_joint"))
+    model = replace(result.model, effects=(Effect(h, np.array([1e6])),))
+    assert refit(setup.problem, model, result.weights, result.remainders, 1) is None

@@ -69,10 +69,13 @@ from ident.torque_fit import (
     data_counts,
     fit,
     inverse,
+    jacobian,
     joint_costs,
     make_weights,
     noise_costs,
+    pack,
     predictions,
+    unpack,
     weighted_cost,
 )
 from ident.trust import shadowed, shown
@@ -269,6 +272,30 @@ def test_a_softer_gear_lets_the_arm_sag_in_the_columns_of_the_drives(identified,
         lacking = exact - (stage.columns[g][..., j] - sag)
         share = np.sum((sag.conj() * lacking)[:, 1:]).real / np.sum(np.abs(sag[:, 1:]) ** 2)
         assert share == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("law", "size"), [("hardening_stiffness", 0.3), ("backlash", 0.3)])
+def test_beside_a_law_of_the_gear_the_column_of_its_spring_knows_where_the_arm_sags(identified, named, monkeypatch, law, size):
+    """Of small motion, at which the law and the geometry are the same in all lines."""
+    monkeypatch.setattr("ident.inverse.NEAR_CHANGE", 1e-9)
+    _, setup, result = identified
+    problem, h, model = setup.problem, named[law, "elbow_joint"], result.model
+    small = replace(problem.groups[0], Q=np.concatenate([problem.groups[0].Q[:, :1], 0.01 * problem.groups[0].Q[:, 1:]], axis=1))
+    problem = replace(problem, groups=(small,))
+
+    def predicted(m, W):
+        return predictions(problem, m, [W], steps=REMAINDER_STEPS)[0]
+
+    sag = np.abs(predicted(model, None).solution.delta[:, 0, 2]).min()
+    p = size * (model.par.stiffness[2] / sag**2 if law == "hardening_stiffness" else sag)
+    model = replace(model, effects=(Effect(h, np.array([p])),))
+    here, x = predicted(model, None), pack(model)
+    ends = [predicted(unpack(model, x + step * (np.arange(len(x)) == 2), np.inf), here.solution.W) for step in (1e-2, -1e-2)]
+    slope = (ends[0].U - ends[1].U)[:, 1 : small.n_compared] / 2e-2
+    column = jacobian(problem, model, small, here, shifts=True).dense()[:, 1 : small.n_compared, :, 2]
+    excited = small.excited[:, 1 : small.n_compared].any(axis=0)
+    off = (np.linalg.norm(column - slope, axis=(0, 2)) / np.linalg.norm(slope, axis=(0, 2)))[excited]
+    assert np.max(off[:5]) < 0.02 and np.median(off) < 0.02
 
 
 def test_a_dead_band_is_screened_where_gravity_has_led_the_gear_through_it(identified, named):

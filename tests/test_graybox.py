@@ -8,6 +8,7 @@ import pytest
 import scipy.linalg
 
 from ident.graybox import LinkChange, Parameters, build_structure, equilibrium, linearise, sampled_frf
+from ident.hypotheses import catalogue
 from robot_assets.robot import Elasticity, load_robot
 
 Q0 = np.array([0.2, -1.2, 0.9, 0.1, 0.5, 0.3])
@@ -125,3 +126,7 @@ def test_the_body_of_a_link_is_changed_with_its_load_or_without(ur10):
     assert whole.isApprox(change.of(both), 1e-9)
     assert alone.isApprox(change.of(bare) + placement.act(pin.Inertia(load.mass, np.array(load.com), np.array(load.inertia))), 1e-9)
     assert whole.mass == pytest.approx(0.9 * both.mass) and alone.mass == pytest.approx(0.9 * bare.mass + load.mass)
+    links = [h for h in catalogue(build_structure(ur10)) if h.key == ("link_inertia", "wrist_3_link")]
+    assert [h.options["with_load"] for h in links] == [False, True]
+    known = build_structure(ur10, inertias={"wrist_3_joint": both})  # what was found holds the load
+    assert sum(h.key == ("link_inertia", "wrist_3_link") for h in catalogue(known)) == 1

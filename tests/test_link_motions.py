@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import diagnose, diagnose_fully, set_up
-from ident.extended import Model
+from ident.extended import Effect, Model
+from ident.hypotheses import catalogue
 from ident.link_sensor import LinkDelay, comparable_links, with_link_encoders
-from ident.torque_fit import data_count, data_counts, jacobian, pack, predictions, unpack
+from ident.torque_fit import data_count, data_counts, jacobian, make_weights, pack, predictions, unpack
 from sim import run_experiment
 from sim.effects import parse_effect
 from sim.experiment import draw_drives
@@ -104,3 +105,13 @@ def test_link_encoders_count_at_their_joints(still):
 def test_multisines_are_compared_without_link_encoders(ur10, tmp_path):
     data = run_experiment(small_plan(ur10, 13, points=1, levels=(1.0,)), [], seed=13, link_encoders=True)
     assert not comparable_links(set_up(through_files(data, tmp_path)).problem)
+
+
+@pytest.mark.parametrize("effect", ["torque_constant", "torque_lag", "torque_delay", "sensor_lag", "sensor_delay"])
+def test_filters_of_drives_and_sensors_leave_the_noise_of_all_outputs_a_covariance(still, effect):
+    problem = linked(still).problem
+    problem = replace(problem, q_std=np.full(6, 1e-5), tau_std=np.full(6, 0.05))
+    h = next(h for h in catalogue(problem.structure) if (h.effect, h.place) == (effect, "elbow_joint"))
+    model = Model(problem.structure, problem.nominal, (Effect(h, np.array([3.0 if effect == "torque_constant" else 5e-3])),))
+    weights = make_weights(problem, predictions(problem, model, [None] * len(problem.groups), steps=None), 0.0)
+    assert all(np.linalg.eigvalsh(S).min() > 0.0 for S in weights.covariance)

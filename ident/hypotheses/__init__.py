@@ -60,12 +60,13 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     if robot.payload_link in chain.bodies:
         out.append(structure.payload(robot.payload_link))
     seen: set[int] = set()
+    known = {chain.carriers[joint] for joint in chain.inertias}  # with what they carry
     for link, (index, _) in chain.bodies.items():
         if index in seen or index == 0:
             continue
         seen.add(index)
         carries = index == chain.bodies.get(robot.payload_link, (0, None))[0]
-        loaded = any(chain.bodies[load.link][0] == index for load in robot.loads)
+        loaded = index not in known and any(chain.bodies[load.link][0] == index for load in robot.loads)
         for with_load in (False, True)[: 1 + loaded]:
             out.append(structure.link_inertia(link, _joint_of_body(chain, index), carries, with_load))
     for j, name in enumerate(names):

@@ -125,7 +125,7 @@ class Hypothesis:
             may have several steady motions with it. ``dry``: a friction that at rest balances what is asked of it.
             ``nats``: log odds before the data, 0 where there is no reason. ``body``: the link whose inertia it changes.
             ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a spring.
-            ``filter(p, s)``: of a drive or a position that is linear, what it does to a line, (L,).
+            ``filter(p, s)``: recorded torque per delivered one, or true position per measured one, of one that is linear, (L,).
             ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
     """
 

@@ -56,6 +56,7 @@ def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
                 "name": cause.effect,
                 "place": cause.joint,
                 "probability": cause.probability,
+                **({"with_load": True} if cause.with_load else {}),
                 "parameters": {k: {"value": v.value, "std": v.std, "unit": v.unit} for k, v in cause.parameters.items()},
             }
         )
