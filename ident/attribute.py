@@ -252,8 +252,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
 
     def other(h: Hypothesis) -> bool:
         """Whether it is not there already: a body with its load is another one than without."""
-        same = h.key == winner.key and h.options.get("with_load") == own.hypothesis.options.get("with_load")
-        return h.key not in there or (h.key == winner.key and "body" in h.options and not same)
+        loaded = [x.options.get("with_load") for x in (h, own.hypothesis)]
+        return h.key not in there or (h.key == winner.key and loaded[0] != loaded[1])
 
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
     rivals = [*rivals[:FINALISTS], *(wider(problem, current, own) if nearly_settled(current) else [])]
