@@ -25,6 +25,7 @@ from ident.evidence import (
     Candidate,
     explained,
     is_wave,
+    last_is_pointless,
     model_error,
     pointless,
     rivals_of_best,
@@ -66,6 +67,7 @@ SETTLED = 0.05  # share of the excess up to which what is left needs no second s
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record, from which its loop is begun
+SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
@@ -163,7 +165,7 @@ def attribute(
         unknown = unknown or (best.hypothesis.decoy and left_share(baseline, current) > LEFT_TO_DECOYS)
         if best.hypothesis.decoy and not best.hypothesis.options.get("baseline"):
             break
-        current = polish(problem, best.fit)
+        current = from_other_motions(problem, polish(problem, best.fit), workers)
         if current.chi2_per_dof > FAINT and not best.hypothesis.decoy:
             current, more = companions(problem, current, best, hypotheses)
             rounds += more
@@ -310,7 +312,7 @@ def pruned(problem: Problem, current: Fit) -> Fit:
     std = dict(zip(current.names, np.sqrt(np.maximum(np.diag(current.covariance()), 0.0)), strict=True))
 
     def nothing(effect: Effect) -> bool:
-        if pointless(effect):
+        if pointless(effect, current.model.par.stiffness[effect.hypothesis.joint]):
             return True
         h = effect.hypothesis
         own = [(q, v, std[h.coordinate(q.name)]) for q, v in zip(h.parameters, effect.p, strict=True) if not q.nuisance]
@@ -348,6 +350,27 @@ def as_loops(problem: Problem, current: Fit, workers: Workers) -> Fit:
         if loops:
             best = polish(problem, min(loops, key=lambda r: r.cost))
             current = best if best.costs[h.joint] <= RECORD_EXCESS * best.counts[h.joint] else current
+    return current
+
+
+def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
+    """The model with laws under which the arm may have several steady motions begun from other sizes, where they leave more than noise.
+
+    Between two sizes at which a record changes from one motion to another the cost has a minimum each.
+    """
+    for effect in current.model.effects:
+        h, resized, j = effect.hypothesis, effect.hypothesis.options.get("bends"), effect.hypothesis.joint
+        if resized is None or is_along_record(h) or current.costs[j] <= DETECTION_EXCESS * current.counts[j]:
+            continue
+        others = tuple(e for e in current.model.effects if e.hypothesis.key != h.key)
+        sizes = [clip_to_bounds(h, resized(effect.p, f, current.model.par.stiffness[j])) for f in LOOP_SIZES[1:]]
+        models = [replace(current.model, effects=(*others, Effect(h, p))) for p in sizes]
+        workers.say(f"other motions: {h.effect} at {h.place}")
+        again = partial(refit, problem, weights=current.weights, remainders=current.remainders)
+        fits = workers.map_in_time(again, models)
+        best = min((r for r in fits if r is not None), key=lambda r: r.cost, default=current)
+        if best.cost < current.cost - MIN_EVIDENCE:
+            current = polish(problem, best)
     return current
 
 
@@ -496,7 +519,7 @@ def attribute_once(
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
-        if not pointless(result.model.effects[-1]) and (id(h) not in best or result.cost < best[id(h)][1].cost):
+        if not last_is_pointless(result) and (id(h) not in best or result.cost < best[id(h)][1].cost):
             best[id(h)] = h, result
     ranked = sorted(best.values(), key=lambda x: x[1].cost)
     if ranked:
@@ -509,13 +532,13 @@ def attribute_once(
 def leaves_much(problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]) -> bool:
     """Whether the best candidate leaves so much that a strong effect may be missing.
 
-    That is anything above the noise where the drives cannot be those of the arm, or where the arm may have several steady
+    That is anything clearly above the noise where the drives cannot be those of the arm, or where the arm may have several steady
     motions under the law of the best; else more than what is faint, and than errors of its law.
     """
-    bent = bool(ranked) and ranked[0][0].options.get("bends", False)
+    bent = bool(ranked) and "bends" in ranked[0][0].options
     spoilt = not problem.motions_alone and (bent or implausible(problem, before))
     excess = before.cost - before.count
-    allowed = (DETECTION_EXCESS - 1.0) * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * excess)
+    allowed = SPOILT * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * excess)
     return min(excess, left_by(ranked)) > allowed
 
 
@@ -551,7 +574,7 @@ def beside_unclear(
         bare: as of ``search.explore``.
     """
     direct, scores = explore(problem, current, hypotheses, 0.0, bare, workers)
-    hopefuls = [(h, r) for h, r in direct if not pointless(r.model.effects[-1])][:FINALISTS]
+    hopefuls = [(h, r) for h, r in direct if not last_is_pointless(r)][:FINALISTS]
     same = workers.map(lambda x: refit(problem, x[1].model, found.before.weights, x[1].remainders), hopefuls)
     known = [(c.hypothesis, c.fit) for c in found.candidates]
     new = [(h, r) for (h, _), r in zip(hopefuls, same, strict=True) if r is not None and all(h is not k for k, _ in known)]

@@ -88,7 +88,7 @@ def conclude(
         found = rounds[effect.hypothesis.key]
         trust = known_probability(left_of(effect.hypothesis, result), doubted)
         trust *= explained_share(found, final)
-        doubtful = pointless(effect) or too_fast(problem, last, effect) or shadowed(found, result.rounds)
+        doubtful = pointless(effect, final.model.par.stiffness[effect.hypothesis.joint]) or too_fast(problem, last, effect) or shadowed(found, result.rounds)
         if doubtful or effect.hypothesis.key in belied or not shown(effect, final, covariance):
             trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))

@@ -136,7 +136,8 @@ def occam(candidate: Candidate, temper: float) -> float:
     count = int(np.sum(~absent))
     options = effect.hypothesis.options
     essential = any(a and q.name == options.get("essential") for q, a in zip(ps, absent, strict=True))
-    nats = POINTLESS_NATS * (essential or pointless(effect))
+    stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
+    nats = POINTLESS_NATS * (essential or pointless(effect, stiffness))
     if count == 0:
         return -nats
     own = np.linalg.inv(inverse(H[np.ix_(keep, keep)], STEADY)[-count:, -count:])
@@ -145,17 +146,22 @@ def occam(candidate: Candidate, temper: float) -> float:
         [q.expected_spread(amplitude if q.name in WAVE else v) for q, v in zip(ps, effect.p, strict=True)]
     )[~absent]
     narrowed = np.linalg.slogdet(np.eye(count) + own * np.outer(spread, spread) / temper)[1]
-    stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
     density = sum(((v - q.prior_center(stiffness)) / q.spread) ** 2 for q, v in zip(ps, x, strict=True))
     return float(-0.5 * narrowed - 0.5 * density - nats)
 
 
-def pointless(effect: Effect) -> bool:
+def pointless(effect: Effect, stiffness: float) -> bool:
     """Whether the parameters of an effect leave nothing of it that another one does not hold, or all lie at a bound."""
     h = effect.hypothesis
     sizes = [(q, v) for q, v in zip(h.parameters, effect.p, strict=True) if q.log and not q.nuisance]
     at_bound = bool(sizes) and all(not q.lower * 1.01 < v < q.upper * 0.99 for q, v in sizes)
-    return at_bound or bool(h.options.get("trivial", lambda p: False)(effect.p))
+    return at_bound or bool(h.options.get("trivial", lambda p, k: False)(effect.p, stiffness))
+
+
+def last_is_pointless(result: Fit) -> bool:
+    """The same of the last effect of a fit."""
+    effect = result.model.effects[-1]
+    return pointless(effect, float(result.model.par.stiffness[effect.hypothesis.joint]))
 
 
 def is_wave(parameters: Sequence[Parameter]) -> bool:

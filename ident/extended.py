@@ -25,15 +25,13 @@ from ident.inverse import (
     solve,
     true_position,
 )
-from ident.records import NOISE_LINES, POINTS_PER_LINE, Group, mean_over_lines
+from ident.records import POINTS_PER_LINE, Group, signal_share
 
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of periodic data, at least
 LOOP_MOST = 3  # the same, at most: modes far above the signals follow at once
 RECORD_AGREED = 1e-5  # step over the deflection that ends them
 RECORD_STEPS = 20  # towards the deflection that agrees with a record
-NOISE_DRAWS = 4  # of the noise that a gear along its record answers to
-LEAST_GAIN = 1e-3  # of a gear, torque at the motor per torque in parallel with its spring, that noise is divided by
 RECORD_BISECTIONS = 30  # of its mean
 LOOP_STEP = 0.5  # its step, at most, over the time scale of the fastest mode
 
@@ -96,7 +94,7 @@ class Prediction:
         """(L, n, n) recorded torque per motor position for small changes about the motion.
 
         What noise on the position becomes in the torque residual. Gears count with their
-        equivalent stiffness: a hardening gear passes on more noise than a linear one. With filters of drives and sensors.
+        mean slope: a hardening gear passes on more noise than a linear one. With filters of drives and sensors.
         """
         Z = self.plane.Z
         if np.any(self.added_stiffness):
@@ -115,55 +113,6 @@ class Prediction:
             if "filter" in h.options:
                 (recorded if h.channel == "drive" else true)[:, h.joint] *= h.options["filter"](effect.p, self.plane.s)
         return recorded, true
-
-    def law_noise(self, group: Group) -> np.ndarray:
-        """(L, n) power that the error of the motion shown to laws at the motors leaves in the torque, N2 m2.
-
-        A friction that turns within a small velocity carries the noise of a motor that stands still
-        with the slope of the turn. By one draw, over all records, of what the motion that laws see is off.
-        """
-        out = np.zeros(self.U.shape[1:])
-        at_motor = [e for e in self.model.effects if e.hypothesis.channel == "motor"]
-        if not at_motor:
-            return out
-        rng = np.random.default_rng(0)
-        draw = rng.normal(size=(2, *self.U.shape)) * np.sqrt(0.5 * group.shown_error)
-        moving = replace(group, rest=None)  # at rest the noise of the position cancels
-        seen = Motion(moving, self.solution, self.par)
-        motions = replace(seen, error=draw[0] + 1j * draw[1]), seen
-        for effect in at_motor:
-            j = effect.hypothesis.joint
-            off, as_seen = (effect.hypothesis.law(effect.p, x, j, self.par.stiffness[j]) for x in motions)
-            change = self.plane.record * self.motion(group).lines(off - as_seen)
-            out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
-        return out
-
-    def record_noise(self, group: Group) -> np.ndarray | None:
-        """(L, n, n) covariance beyond that of the linear arm where gears answer to the recorded torque; None where none does.
-
-        Of all that noise leaves through laws, those at the motors too: by ``NOISE_DRAWS`` over all records.
-        """
-        joints = sorted(joints_along_record(self.model, group))
-        if not joints:
-            return None
-        rng = np.random.default_rng(0)
-        # Taken off before the mean over lines, and put back: the gain of a gear is sharp at its resonance.
-        passed = np.ones(self.U.shape[1:])
-        for j in joints:
-            passed[:, j] = np.maximum(np.abs(self.plane.spring_gain[:, j, j]), LEAST_GAIN)
-        more = np.zeros((*passed.shape, passed.shape[1]), complex)
-        for _ in range(NOISE_DRAWS):
-            draw = rng.normal(size=(4, *self.U.shape))
-            position = (draw[0] + 1j * draw[1]) * np.sqrt(0.5 * group.position_noise)
-            torque = (draw[2] + 1j * draw[3]) * np.sqrt(0.5 * group.torque_noise)
-            moved = replace(group, Q=group.Q + position, U=group.U + torque)
-            there = predict_at(
-                self.model, self.structure, self.par, self.plane, moved, self.sampling, W=self.solution.W, steps=0
-            )
-            linear = torque - np.einsum("lij,slj->sli", self.sampled_impedance, position)
-            for x, sign in ((torque + self.U - there.U, 1.0), (linear, -1.0)):
-                more += sign * np.einsum("sli,slj->lij", x / passed, x.conj() / passed) / len(x) / NOISE_DRAWS
-        return passed[:, :, None] * mean_over_lines(more, NOISE_LINES) * passed[:, None, :]
 
 
 def joints_along_record(model: Model, group: Group) -> set[int]:
@@ -238,7 +187,7 @@ def predict_at(
         at_motors = plane.record[:, None] * _motor_torques(par, Motion(group, solution, par), motor)
         solution = replace(solution, U=solution.U + at_motors)
     U = through_drives(by_channel.get("drive", []), Motion(group, solution, par))
-    added = _added_stiffness(solution, by_channel.get("spring", []))
+    added = _added_stiffness(par, Motion(group, solution, par), by_channel.get("spring", []))
     return Prediction(model, sampling, structure, par, plane, solution, U, added)
 
 
@@ -251,12 +200,14 @@ def through_drives(effects: Sequence[Effect], motion: Motion) -> np.ndarray:
     return U
 
 
-def _added_stiffness(solution: Solution, effects: Sequence[Effect]) -> np.ndarray:
-    """(n,) regression of the torques of gear effects on the deflection, lines above zero, N m/rad."""
-    out = np.zeros(solution.delta.shape[-1])
-    for j in {e.hypothesis.joint for e in effects if e.hypothesis.gear_law}:
-        delta, torque = solution.delta[:, 1:, j], solution.torques.spring[:, 1:, j]
-        out[j] = np.sum(torque * delta.conj()).real / max(np.sum(np.abs(delta) ** 2), 1e-300)
+def _added_stiffness(par: Parameters, motion: Motion, effects: Sequence[Effect]) -> np.ndarray:
+    """(n,) mean slope of the torques of gear effects along the deflection, N m/rad."""
+    out = np.zeros(len(par.stiffness))
+    for effect in effects:
+        if effect.hypothesis.gear_law:
+            j = effect.hypothesis.joint
+            law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
+            out[j] += np.mean(kernels.mean_slope(law, motion.delta(j)))
     return out
 
 
@@ -305,7 +256,9 @@ def _inner_torques(
         if effect.hypothesis.channel == "link":
             others = at_link.get(j, 0.0)
             guess = old_link[..., c] - others
-            at_link[j] = others + _loop(effect.hypothesis.options["loop"](effect.p), grid, solution.Q_driven[..., j] + compliance * guess, modes, guess)
+            noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=False))
+            free = solution.Q_driven[..., j] + compliance * guess
+            at_link[j] = others + _loop(effect.hypothesis.options["loop"](effect.p), grid, free, noise, compliance, modes, guess)
         else:
             others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
@@ -315,7 +268,9 @@ def _inner_torques(
                 motor[..., j] += left
             else:
                 guess = old_gear[..., j] - others
-                at_gear[j] = others + _loop(law, grid, solution.delta[..., j] + compliance * guess, modes, guess)
+                noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=True))
+                free = solution.delta[..., j] + compliance * guess
+                at_gear[j] = others + _loop(law, grid, free, noise, compliance, modes, guess)
     for j, value in at_gear.items():
         old_gear[..., j] = value
     for j, value in at_link.items():
@@ -446,15 +401,46 @@ def _modes(
     return grid, kernels.modal_compliance(plane.lin.M, D, K, int(column), group.period_time / grid.n_time)
 
 
+def motion_per_position(structure: Structure, par: Parameters, plane: Plane, joint: int, *, gear: bool) -> np.ndarray:
+    """(L, n) deflection of the gear of a joint per motor position, without laws; of its link where not of the ``gear``."""
+    link = (plane.A_inv[:, structure.driven[joint], structure.driven] * plane.C) @ par.coupling
+    return par.coupling[joint] - link if gear else link
+
+
+def noise_of_motion(group: Group, per_position: np.ndarray) -> np.ndarray:
+    """(L,) variance that noise of the positions has in a motion, rad2; none of a motion whose lines are seen through a window.
+
+    Args:
+        per_position: (L, n) of ``motion_per_position``.
+    """
+    if group.window is not None:
+        return np.zeros(len(per_position))
+    return np.einsum("li,li->l", np.abs(per_position) ** 2, group.position_noise)
+
+
 def _loop(
-    law: kernels.Law, grid: Group, free: np.ndarray, modes: np.ndarray, guess: np.ndarray
+    law: kernels.Law,
+    grid: Group,
+    free: np.ndarray,
+    noise: np.ndarray,
+    compliance: np.ndarray,
+    modes: np.ndarray,
+    guess: np.ndarray,
 ) -> np.ndarray:
     """Spectrum (S, L) of the torque of a law in steady state with the arm.
 
+    A law turns noise of a motion into a bias, and passes that of each line on to all others. It is shown the lines that
+    are signal; the others it answers with its mean slope.
+
     Args:
-        free: (S, L) where the arm would be without; guess: (S, L) torque to begin with.
+        free: (S, L) where the arm would be without; noise: (L,) variance of its lines; compliance: (L,) of the arm there;
+            guess: (S, L) torque to begin with.
     """
-    x = grid.to_time(free[..., None])[..., 0]
-    rate = grid.to_time((1j * grid.omega * free)[..., None])[..., 0] if law.code == kernels.LINK else x
+    share = signal_share(free, noise)
+    shown = share * free
+    x = grid.to_time(shown[..., None])[..., 0]
+    rate = grid.to_time((1j * grid.omega * shown)[..., None])[..., 0] if kernels.sees_rate(law) else x
     start = modal_state(guess, grid.omega, grid.period_time / grid.n_time, modes)
-    return grid.to_lines(steady_loop(law, x, rate, modes, start)[..., None])[..., 0]
+    torque = grid.to_lines(steady_loop(law, x, rate, modes, start)[..., None])[..., 0]
+    slope = kernels.mean_slope(law, grid.to_time((shown - compliance * torque)[..., None])[..., 0])[:, None]
+    return torque + slope / (1.0 + slope * compliance) * (free - shown)

@@ -123,7 +123,7 @@ class Group:
         Laws that turn on a reversal see a noisy position reverse where the joint stands still; they
         are shown the motion without the lines that hold noise alone.
         """
-        return _signal_share(self.Q, self.position_noise)
+        return signal_share(self.Q, self.position_noise)
 
     @cached_property
     def shown_error(self) -> np.ndarray:
@@ -143,7 +143,7 @@ class Group:
     @cached_property
     def torque_share(self) -> np.ndarray:
         """(S, L, n) the same of the torque: a law that clips it would clip its noise, and so explain that."""
-        return _signal_share(self.U, self.torque_noise)
+        return signal_share(self.U, self.torque_noise)
 
     @cached_property
     def torque_noise(self) -> np.ndarray:
@@ -213,8 +213,8 @@ def _line_noise(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
     return mean_over_lines(power, NOISE_LINES)
 
 
-def _signal_share(X: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Share of each line (S, L, n) that is signal; the mean is."""
+def signal_share(X: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Share of each line (S, L, ...) that is signal, of which ``noise`` (L, ...) is the variance; the mean is."""
     share = np.maximum(1.0 - SIGNAL_LEVEL * noise / np.maximum(np.abs(X) ** 2, 1e-300), 0.0)
     share[:, 0] = 1.0
     return share

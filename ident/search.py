@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from ident.baseline import DETECTION_EXCESS, HOPELESS, implausible
-from ident.evidence import explained, pointless
+from ident.evidence import explained, last_is_pointless
 from ident.extended import Effect, Model, Prediction, along_record, as_loop, is_along_record
 from ident.hypotheses import Hypothesis
 from ident.parallel import Workers
@@ -144,7 +144,7 @@ def explore_softly(
     stage, level = soften(problem, current)
     found, scores = explore(problem, stage, hypotheses, 0.0, ANSWERED, workers, rough=True)
     # Of laws of which nothing is left but a special case, that one goes on.
-    last = [(h, r) for h, r in found if not pointless(r.model.effects[-1])][:FINALISTS]
+    last = [(h, r) for h, r in found if not last_is_pointless(r)][:FINALISTS]
     softly = {h.key: explained(stage, r, noise=0.0) for h, r in last}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
@@ -242,10 +242,10 @@ def explore(
     found = begun(chosen)
     if not workers.late:
         found += begun(other_bodies(found, chosen, scores))
-    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; along the record the
-    # law itself leaves that much.
-    along = any(is_along_record(e.hypothesis) for e in stage.model.effects)
-    unclear = stage.chi2_per_dof <= FAINT and not along and left_by(found) > (DETECTION_EXCESS - 1.0) * stage.count
+    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law along the
+    # record, or under which a record may be in another steady motion, leaves that much itself.
+    rough_law = any(is_along_record(e.hypothesis) or "bends" in e.hypothesis.options for e in stage.model.effects)
+    unclear = stage.chi2_per_dof <= FAINT and not rough_law and left_by(found) > (DETECTION_EXCESS - 1.0) * stage.count
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
@@ -422,7 +422,7 @@ def beside_strong(
     for here in (True, False):
         some = [s for s in chosen if (s.hypothesis.joint == likely) == here]
         fits = workers.map_in_time(annealed, some, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
-        pairs += [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not pointless(r.model.effects[-1])]
+        pairs += [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not last_is_pointless(r)]
         if any(h.key == key and settled(r) for h, r in pairs):
             break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]

@@ -37,6 +37,7 @@ from ident.extended import (
 )
 from ident.graybox import Parameters, Structure, parameter_names
 from ident.inverse import REMAINDER_STEPS, Motion, Sampling, Torques, baseline_products
+from ident.law_noise import law_noise, loop_noise, record_noise
 from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
 from ident.posture import moved_by_posture
@@ -179,12 +180,14 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
         samples=problem.samples(group),
     )
     k = np.arange(S.shape[1])
-    more = prediction.record_noise(group)
-    if more is None:
+    of_record, of_loops = record_noise(prediction, group), loop_noise(prediction, group)
+    if of_record is None:
         S = S.copy()
-        S[:, k, k] += prediction.law_noise(group)[: group.n_compared]
+        S[:, k, k] += law_noise(prediction, group)[: group.n_compared]
     else:
-        S = _with_record(S, more[: group.n_compared])
+        S = _with_record(S, of_record[: group.n_compared])
+    if of_loops is not None:
+        S = S + of_loops[: group.n_compared]
     if np.any(problem.step_std):
         variance = np.broadcast_to(np.square(problem.step_std) / problem.samples(group), k.shape)
         S += white_covariance(prediction.sampled_impedance[: group.n_compared], 0.0 * variance, variance)

@@ -81,7 +81,7 @@ def test_a_law_that_is_nothing_leaves_what_the_loop_leaves(clean):
     names = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
     model = Model(problem.structure, replace(problem.nominal, **{k: drives[v] for k, v in names.items()}))
     backlash = next(h for h in catalogue(problem.structure) if h.key == ("backlash", "shoulder_pan_joint"))
-    nothing = Effect(backlash, np.array([1e-9]))
+    nothing = Effect(backlash, np.array([1e-9, 0.0]))
     (_, loop), (_, along) = (
         cost_of(problem, replace(model, effects=(replace(nothing, hypothesis=h),))) for h in (backlash, along_record(backlash))
     )
@@ -96,10 +96,10 @@ def test_a_gear_that_rattles_is_explained_along_its_record_alone(rattling):
     problem, model, backlash, gap = rattling
     along, count = along_record(backlash), sum(g.n_compared * 2 * len(g.segments) for g in problem.groups)
     of_loop, of_record = (
-        cost_of(problem, replace(model, effects=(Effect(h, np.array([gap])),)))[0] for h in (backlash, along)
+        cost_of(problem, replace(model, effects=(Effect(h, np.array([gap, 0.0])),)))[0] for h in (backlash, along)
     )
     assert of_record.max() < 5.0 * count and of_loop[0] > 1e3 * count
-    start = replace(model, effects=(Effect(along, np.array([0.7 * gap])),))
+    start = replace(model, effects=(Effect(along, np.array([0.7 * gap, 0.0])),))
     result = fit(problem, start, iterations=15)
     assert result.model.effects[0].p[0] == pytest.approx(gap, rel=0.02)
     kept, _ = simulated(problem, along, result)
@@ -112,7 +112,7 @@ def test_the_deflection_along_a_record_is_found_beside_a_strong_damper(rattling,
     par = replace(model.par, damping=30.0 * model.par.damping)
     group = problem.groups[0]
     assert group.omega[-1] * par.damping[0] > 2.0 * par.stiffness[0]
-    model = replace(model, par=par, effects=(Effect(along_record(backlash), np.array([gap])),))
+    model = replace(model, par=par, effects=(Effect(along_record(backlash), np.array([gap, 0.0])),))
     few = predict(model, group, problem.sampling).outputs(group)[..., 0]
     monkeypatch.setattr("ident.extended.RECORD_STEPS", 200)
     many = predict(model, group, problem.sampling).outputs(group)[..., 0]
@@ -123,12 +123,12 @@ def test_columns_beside_a_gear_along_its_record_are_the_differences(rattling):
     """Of the gear, its motor, the timing and friction at the same joint, whose torque the record holds already."""
     problem, model, backlash, gap = rattling
     friction = next(h for h in catalogue(problem.structure) if h.key == ("coulomb_friction", "shoulder_pan_joint"))
-    effects = (Effect(along_record(backlash), np.array([gap])), Effect(friction, np.array([2.0, 0.1, 5e-3])))
+    effects = (Effect(along_record(backlash), np.array([gap, 0.0])), Effect(friction, np.array([2.0, 0.1, 5e-3])))
     model, group, n = replace(model, effects=effects), problem.groups[0], problem.structure.n
     pred = predict(model, group, problem.sampling)
     J, x = jacobian(problem, model, group, pred).dense(), pack(model)
     m = len(model.par.to_log())
-    for c, step in ((0, 1e-4), (n, 1e-4), (2 * n, 1e-5), (3 * n, 1e-4), (m, 1e-6), (m + 1, 1e-4), (m + 2, 1e-4)):
+    for c, step in ((0, 1e-4), (n, 1e-4), (2 * n, 1e-5), (3 * n, 1e-4), (m, 1e-6), (m + 1, 1e-4), (m + 3, 1e-4)):
         ends = []
         for sign in (1.0, -1.0):
             y = x.copy()
@@ -142,7 +142,7 @@ def test_a_drive_with_an_effect_is_predicted_by_the_loop(rattling):
     """Its record is not the torque of the motor; that of another joint does not matter."""
     problem, model, backlash, gap = rattling
     named = {h.key: h for h in catalogue(problem.structure)}
-    along = Effect(along_record(backlash), np.array([gap]))
+    along = Effect(along_record(backlash), np.array([gap, 0.0]))
     for joint, expected in (("shoulder_pan_joint", set()), ("elbow_joint", {0})):
         constant = Effect(named["torque_constant", joint], np.array([0.9]))
         assert joints_along_record(replace(model, effects=(along, constant)), problem.groups[0]) == expected

@@ -201,7 +201,7 @@ def test_an_encoder_that_is_off_its_centre_errs_by_the_true_angle(identified):
 
 def test_a_law_and_its_limit_tie_where_the_data_cannot_tell_them_apart(named):
     gap, soft = named["backlash", "elbow_joint"], named["softening_stiffness", "elbow_joint"]
-    one, two = candidate(gap, [5e-4], [1e5]), candidate(soft, [3e3, 3e-4], [0.0, 1e5])
+    one, two = candidate(gap, [5e-4, 0.0], [1e5, 0.0]), candidate(soft, [3e3, 3e-4], [0.0, 1e5])
     assert [c.probability for c in weigh([one, two], 100.0)] == pytest.approx([0.5, 0.5], abs=0.01)
     better = candidate(soft, [3e3, 3e-4], [0.0, 1e5], cost=900.0)
     assert weigh([one, better], 100.0)[0].hypothesis is soft
@@ -245,8 +245,9 @@ def test_a_unit_response_holds_what_the_arm_does_where_it_comes_to_stand(identif
     if channel != "spring":
         constant = torque_offset(h.joint, h.place)
         h = replace(constant, channel=channel, law=lambda p, m, j, k: m.lines(constant.law(p, m, j, k)) if channel == "position" else constant.law(p, m, j, k))
+    p = np.array([value, *np.zeros(len(h.parameters) - 1)])
     preds = predictions(problem, result.model, result.remainders, steps=8)
-    moved = predictions(problem, replace(result.model, effects=(Effect(h, np.array([value])),)), result.remainders, steps=8)
+    moved = predictions(problem, replace(result.model, effects=(Effect(h, p),)), result.remainders, steps=8)
     for group, a, b in zip(problem.groups, preds, moved, strict=True):
         delta = a.motion(group).delta(h.joint)
         assert np.all(np.sign(delta) == np.sign(delta[0, 0]))  # the gear stays on one flank
@@ -288,7 +289,7 @@ def test_beside_a_law_of_the_gear_the_column_of_its_spring_knows_where_the_arm_s
 
     sag = np.abs(predicted(model, None).solution.delta[:, 0, 2]).min()
     p = size * (model.par.stiffness[2] / sag**2 if law == "hardening_stiffness" else sag)
-    model = replace(model, effects=(Effect(h, np.array([p])),))
+    model = replace(model, effects=(Effect(h, np.array([p, *np.zeros(len(h.parameters) - 1)])),))
     here, x = predicted(model, None), pack(model)
     ends = [predicted(unpack(model, x + step * (np.arange(len(x)) == 2), np.inf), here.solution.W) for step in (1e-2, -1e-2)]
     slope = (ends[0].U - ends[1].U)[:, 1 : small.n_compared] / 2e-2
@@ -302,13 +303,13 @@ def test_a_dead_band_is_screened_where_gravity_has_led_the_gear_through_it(ident
     """It changes nothing but the posture of the arm, by half of its width."""
     _, setup, result = identified
     problem, gap, h = setup.problem, 1e-3, named["backlash", "elbow_joint"]
-    models = result.model, replace(result.model, effects=(Effect(h, np.array([gap])),))
+    models = result.model, replace(result.model, effects=(Effect(h, np.array([gap, 0.0])),))
     before, after = (predictions(problem, m, result.remainders, steps=8) for m in models)
     changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
     problem = replace(problem, groups=tuple(changed))
     bands = [x for x in named.values() if x.effect == "backlash"]
     first, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), bands)
-    assert first.hypothesis is h and first.start == pytest.approx([gap], rel=0.1)
+    assert first.hypothesis is h and first.start == pytest.approx([gap, 0.0], rel=0.1)
 
 
 def test_a_cause_begins_beside_the_drives_that_have_taken_its_place(identified, named):
@@ -440,11 +441,13 @@ def test_an_offset_of_a_torque_record_is_no_spring(clean, tmp_path):
 def test_an_effect_at_its_bounds_is_none(named):
     backlash = named["backlash", "elbow_joint"]
     gap = backlash.parameters[0]
-    assert pointless(Effect(backlash, np.array([gap.lower])))
-    assert not pointless(Effect(backlash, np.array([1e-4])))
+    assert pointless(Effect(backlash, np.array([gap.lower, 0.0])), 1e4)
+    assert not pointless(Effect(backlash, np.array([1e-4, 0.0])), 1e4)
     spring = named["gravity_spring", "elbow_joint"]
-    assert pointless(Effect(spring, np.array([0.1, -9.9])))
-    assert not pointless(Effect(spring, np.array([300.0, 1.0])))
+    assert pointless(Effect(spring, np.array([0.1, -9.9])), 1e4)
+    assert not pointless(Effect(spring, np.array([300.0, 1.0])), 1e4)
+    soft = named["softening_stiffness", "elbow_joint"]  # as soft as a dead band, it is one
+    assert [pointless(Effect(soft, np.array([share * 1e4, 1e-4])), 1e4) for share in (0.02, 0.3)] == [True, False]
 
 
 def test_a_gear_far_from_its_guess_has_gone_astray(identified):
@@ -751,7 +754,7 @@ def test_plain_friction_widens_to_laws_that_hold_it(named):
         h, size = named[effect, "elbow_joint"], 3.0
         scale = SimpleNamespace(v=0.1, q=0.02)
         for p in h.options["widens"](np.array([size, 0.1, 1e-3]), scale):
-            assert len(p) == len(h.parameters) and not pointless(Effect(h, p))
+            assert len(p) == len(h.parameters) and not pointless(Effect(h, p), 1e4)
             assert all(q.lower < v < q.upper or v == q.null for q, v in zip(h.parameters, p, strict=True))
             special = h.options["special"](p)
             assert 0.5 * size < special[0] < 2.0 * size
@@ -787,7 +790,7 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
         tried.add(start.effects[-1].hypothesis.joint)
         return replace(baseline, model=start, costs=left * baseline.counts)
 
-    scores = [Score(h, 1.0, 1, np.array([1e-4]), np.ones(1), ()) for h in (other, backlash)]
+    scores = [Score(h, 1.0, 1, np.array([1e-4, 0.0]), np.ones(1), ()) for h in (other, backlash)]
     monkeypatch.setattr("ident.search.strong_effects", lambda *args: scores)
     monkeypatch.setattr("ident.search.anneal", annealed)
     monkeypatch.setattr("ident.search.simulated", lambda problem, h, result: (h, result))

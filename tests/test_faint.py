@@ -117,7 +117,7 @@ def test_nothing_faint_is_sought_where_the_noise_is_not_measured(identified, hyp
 def test_a_law_along_the_record_hides_more_and_its_joint(identified, hypotheses):
     _, setup, baseline = identified
     h = along_record(next(h for h in hypotheses if h.key == ("backlash", "elbow_joint")))
-    model = replace(baseline.model, effects=(Effect(h, np.array([1e-7])),))
+    model = replace(baseline.model, effects=(Effect(h, np.array([1e-7, 0.0])),))
     along = replace(baseline, model=model)
     scores = faint_scores(setup.problem, along, hypotheses, np.zeros(6))
     assert {s.hypothesis.joint for s in scores if not s.hypothesis.on_chain} == set(range(6)) - {h.joint}

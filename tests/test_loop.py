@@ -14,6 +14,8 @@ M, D, K = np.array([[1.0, 0.2], [0.2, 0.5]]), np.diag([1.5, 0.8]), np.array([[4e
 LAWS = {
     "cubic": kernels.Law(kernels.CUBIC, 4e8, 0.0, 4e3),
     "softening": kernels.Law(kernels.SOFTENING, 2.5e3, 1e-3, 4e3),
+    "backlash": kernels.Law(kernels.BACKLASH, 6e-4, 0.0, 2e3),
+    "loose backlash": kernels.Law(kernels.BACKLASH, 6e-4, 0.8, 2e3),
     "hysteresis": kernels.Law(kernels.HYSTERESIS, 1e3, 0.5, 4e3),
     "rounded hysteresis": kernels.Law(kernels.HYSTERESIS, 1e3, 0.5, 4e3, 2.0, 0.3),
     "cable": kernels.Law(kernels.LINK, 300.0, 0.8, 0.01),
@@ -58,6 +60,8 @@ def law_along(law, x, v):
         return a * x**3
     if code == kernels.SOFTENING:
         return (a - k) * np.clip(x, -b, b)
+    if code == kernels.BACKLASH:
+        return -k * np.clip(x, -0.5 * a, 0.5 * a) - b * v * (np.abs(x) < 0.5 * a)
     return along_path(x - np.roll(x, 1, axis=1), a, b, exponent, recoil)
 
 
@@ -77,6 +81,23 @@ def test_the_torque_is_that_of_the_law_where_it_moves_the_arm(name):
     expected = law_along(LAWS[name], in_time(there), in_time(1j * OMEGA * there))
     assert np.std(h - expected) < 5e-3 * np.std(expected)
     assert np.std(in_time(compliance() * H)) > 0.03 * np.std(in_time(X))  # the law does move the arm
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_along_a_motion_is_the_law_and_its_mean_slope_what_a_small_step_does(name):
+    law, X = LAWS[name], free_motion()
+    x, v, step = in_time(X), in_time(1j * OMEGA * X), 1e-7
+    h = kernels.along_motion(law, x, v)
+    assert h == pytest.approx(law_along(law, x, v), abs=1e-9 * np.abs(h).max())
+    slope = kernels.mean_slope(law, x)
+    if law.code in (kernels.HYSTERESIS, kernels.CABLE):  # of what yields: the line nearest to its loops
+        moving = x - x.mean(axis=1, keepdims=True)
+        left = h - slope[:, None] * moving
+        assert np.mean(left * moving, axis=1) == pytest.approx(0.0, abs=1e-9 * np.mean(np.abs(h * moving)))
+    else:
+        standing = np.zeros_like(v)  # a damper does not see where it is
+        change = kernels.along_motion(law, x + step, standing) - kernels.along_motion(law, x - step, standing)
+        assert slope == pytest.approx(np.mean(change, axis=1) / (2 * step), rel=0.01)
 
 
 @pytest.mark.parametrize("name", LAWS)

@@ -11,6 +11,7 @@ from ident.diagnosis import diagnose, set_up
 from ident.extended import Effect, Model, predict
 from ident.gain import mean_squares, stretch_squares
 from ident.hypotheses import catalogue
+from ident.law_noise import law_noise
 from ident.records import build_groups, close_motion
 from ident.torque_fit import data_count, make_weights
 from robot_assets.robot import load_robot
@@ -163,4 +164,4 @@ def test_what_that_leaves_in_a_friction_is_what_is_said(smoothing):
     motion = seen.motion(group)
     exact = replace(motion, error=truth - group.signal_share * seen.solution.Q)
     off = motion.lines(friction.law(effect.p, motion, 0, 0.0) - friction.law(effect.p, exact, 0, 0.0))
-    assert np.mean(seen.law_noise(group)) / np.mean(np.abs(off) ** 2) == pytest.approx(1.0, abs=0.3)
+    assert np.mean(law_noise(seen, group)) / np.mean(np.abs(off) ** 2) == pytest.approx(1.0, abs=0.3)

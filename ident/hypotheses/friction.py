@@ -139,7 +139,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "apart": "stribeck_velocity",
             "special": lambda p: np.array([p[0], 0.0, p[3]]),
             "dry": True,
-            "trivial": lambda p: p[1] < 1.15 * p[0],
+            "trivial": lambda p, k: p[1] < 1.15 * p[0],
             "widens": lambda p, s: [np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2]]) for f in (0.05, 0.3)],
         },
     )

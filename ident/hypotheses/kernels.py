@@ -22,8 +22,8 @@ class Law(NamedTuple):
     """A law of the gear, or of a cable on a link.
 
     Attributes:
-        code: which; a, b: its parameters. ``HYSTERESIS`` yields at ``b`` after a stiffness ``a``; ``LINK`` is
-            ``a x + b tanh(x' / k)`` on a link; ``CABLE`` is ``a x`` and a spring ``k`` that yields at ``b`` there.
+        code: which; a, b: its parameters. ``BACKLASH`` takes ``k x`` within a dead band ``a`` wide, and a damper ``b`` with it;
+            ``HYSTERESIS`` yields at ``b`` after a stiffness ``a``; ``LINK`` is ``a x + b tanh(x' / k)`` on a link; ``CABLE`` is ``a x`` and a spring ``k`` that yields at ``b`` there.
         k: linear stiffness of the gear, N m/rad.
         exponent, recoil: of an element that yields (see ``yielding``); a Maxwell slip where nothing is said.
     """
@@ -118,11 +118,52 @@ def spring_point(
     return x
 
 
+def sees_rate(law: Law) -> bool:
+    """Whether a law depends on a velocity."""
+    return law.code == LINK or (law.code == BACKLASH and law.b > 0.0)
+
+
 def largest_slope(law: Law, reach: float) -> float:
     """Largest stiffness of a nonlinear gear within a deflection ``reach``, N m/rad."""
     if law.code == CUBIC:
         return law.k + 3.0 * law.a * reach**2
     return law.k + law.a * (1.0 + max(law.recoil, 0.0)) if law.code == HYSTERESIS else law.k
+
+
+def mean_slope(law: Law, x: np.ndarray) -> np.ndarray:
+    """Torque of a law per small deflection beside a motion ``x`` (S, T), in the mean over time; (S,) N m/rad.
+
+    Of an element that yields, which has no slope of its own, that of its torque on the deflection.
+    """
+    if law.code == CUBIC:
+        return 3.0 * law.a * np.mean(x**2, axis=1)
+    if law.code == BACKLASH:
+        return -law.k * np.mean(np.abs(x) < 0.5 * law.a, axis=1)
+    if law.code == SOFTENING:
+        return (law.a - law.k) * np.mean(np.abs(x) < law.b, axis=1)
+    if law.code == LINK:
+        return np.full(len(x), law.a)
+    x = x - x.mean(axis=1, keepdims=True)
+    if law.code == CABLE:
+        torque = law.a * x + along_path(steps_of(x), law.k, law.b, SLIP, 0.0)
+    else:
+        torque = along_path(steps_of(x), law.a, law.b, law.exponent, law.recoil)
+    return np.sum(torque * x, axis=1) / np.maximum(np.sum(x**2, axis=1), 1e-300)
+
+
+def along_motion(law: Law, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Torque (S, T) of a law along a periodic motion (S, T) and its rate, N m."""
+    if law.code == LINK:
+        return law.a * x + law.b * np.tanh(rate / law.k)
+    if law.code == CABLE:
+        return law.a * x + along_path(steps_of(x), law.k, law.b, SLIP, 0.0)
+    torque = along_deflection(*law, x, np.zeros(len(x)), 0)
+    return torque - law.b * rate * (np.abs(x) < 0.5 * law.a) if law.code == BACKLASH else torque
+
+
+def steps_of(x: np.ndarray) -> np.ndarray:
+    """Steps (S, T) of a periodic motion, each from the sample before."""
+    return np.diff(x, axis=1, prepend=x[:, -1:])
 
 
 @njit(cache=True, nogil=True)
@@ -205,6 +246,15 @@ def link_point(stiffness: float, friction: float, turn: float, q: float, v: floa
     return (stiffness * q + (friction * y if wanted >= 0 else -friction * y)) / slope
 
 
+@njit(cache=True, nogil=True)
+def loose_point(gap: float, damping: float, k: float, q: float, v: float, dq: float, dv: float) -> float:
+    """Torque ``h`` that takes spring and damper from a gear within its dead band: there ``-k x - damping x'`` at ``x = q - dq h``."""
+    h = -(k * q + damping * v) / max(1.0 - k * dq - damping * dv, 1e-6)
+    if abs(q - dq * h) <= 0.5 * gap:
+        return h
+    return -0.5 * k * gap if q - dq * h > 0.0 else 0.5 * k * gap
+
+
 @njit(cache=True, nogil=True, fastmath=VECTORS)
 def loop_sweep(
     code: int,
@@ -224,7 +274,7 @@ def loop_sweep(
 
     Args:
         code, a, b, k, exponent, recoil: as in ``Law``.
-        linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
+        linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for laws that ask for it alone.
         modes: (4, modes) complex: poles, decay, gain_old, gain_new.
         start: (modes, S) complex state of the modes one step before the period.
         memory: (3, S) deflection, the one before and torque there; replaced by those at the end.
@@ -234,7 +284,7 @@ def loop_sweep(
         (modes, S) state at the end, and (S,) largest change of the torque over the largest torque.
     """
     T, S = linear.shape
-    rounded = code == 3 and exponent < SLIP
+    rounded, damped = code == 3 and exponent < SLIP, code == 1 and b > 0.0
     poles, decay, gain_old, gain_new = modes
     # A mode without the share of the torque of this step: that of the next one follows from both in one go.
     gain = decay * gain_new + gain_old
@@ -255,15 +305,21 @@ def loop_sweep(
         for m in range(len(decay)):
             for i in range(S):
                 free[i] -= re[m, i]
-        if code == 4:
+        if code == 4 or damped:
             for i in range(S):
                 free_rate[i] = rate[t, i]
             for m in range(len(decay)):
                 p, w = poles[m].real, poles[m].imag
                 for i in range(S):
                     free_rate[i] -= p * re[m, i] - w * im[m, i]
+        if code == 4:
             for i in range(S):
                 h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
+        elif damped:
+            for i in range(S):
+                h[i] = loose_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
+                past[i] = x[i]
+                x[i] = free[i] - direct * h[i]
         else:
             for i in range(S):
                 if rounded:

@@ -23,7 +23,7 @@ def steady_loop(
     yields creeps for many periods.
 
     Args:
-        linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for ``LINK`` alone.
+        linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for laws that see it alone.
         modes: (4, modes) complex, of ``kernels.modal_compliance``.
         guess: (modes, S) complex state from which to begin; rest where None.
     """

@@ -120,7 +120,7 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
         "A spring of {stiffness:.3g} N m/rad with rest at {rest_angle:.3g} rad pulls on the link of {joint}: static"
         " torque that is linear in posture.",
         variable="q",
-        options={"trivial": lambda p: abs(p[1]) > 0.95 * FARTHEST_REST},  # a constant torque
+        options={"trivial": lambda p, k: abs(p[1]) > 0.95 * FARTHEST_REST},  # a constant torque
     )
 
 
@@ -162,7 +162,7 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
         options={
             "loop": lambda p: kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2]) if yields else kernels.Law(kernels.LINK, p[0], p[1], p[2]),
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the motor.
-            "trivial": lambda p: p[0] < 0.2 * p[1],
+            "trivial": lambda p, k: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
             "absorb": lambda p, weights, old: np.array([old[0], p[1], p[2]]),
         },
@@ -392,7 +392,7 @@ def compliance(
             "hinge": at,
             "axis": axis,
             "before": before,
-            "trivial": lambda p: p[0] > 0.1 * STIFFEST,
+            "trivial": lambda p, k: p[0] > 0.1 * STIFFEST,
         },
     )
 

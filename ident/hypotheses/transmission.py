@@ -12,6 +12,7 @@ from ident.hypotheses.yielding import elastoplastic
 from ident.inverse import Motion
 
 ROUNDED = 5.0  # exponent of a hysteresis before the data
+MOST_DAMPING = 0.02  # s, of a gear, over its stiffness
 SOFTEST = 0.05  # share of its stiffness that a soft middle keeps at least: with less it is a dead band
 
 
@@ -33,25 +34,28 @@ def hardening_stiffness(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} stiffens with its deflection (cubic term {cubic:.3g} N m/rad3): the resonance"
         " climbs with amplitude and with gravity load.",
         variable="delta",
-        options={"size": lambda s: np.array([0.3 * s.stiffness / s.delta_rms**2]), "bends": True},
+        options={"size": lambda s: np.array([0.3 * s.stiffness / s.delta_rms**2]), "bends": lambda p, f, k: p * f},
     )
 
 
 def backlash(joint: int, place: str) -> Hypothesis:
-    """Dead band of width ``gap`` in the gear's deflection."""
+    """Dead band of width ``gap`` in the gear's deflection.
+
+    Within it the gear's damper acts as outside, or is ``loose`` as its spring is: a part of it, as a time constant of the spring.
+    """
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         if not shape:
             # A gear that always carries its load one way is through its dead band, however wide: the arm stands elsewhere.
             delta = motion.delta(j)
             carried = -0.5 * k * np.sign(delta).mean(axis=1, keepdims=True)
-            return Screen((np.broadcast_to(carried, delta.shape),), lambda c: np.array([c[0]]) if c[0] > 0.0 else None, shape)
+            return Screen((np.broadcast_to(carried, delta.shape),), lambda c: np.array([c[0], 0.0]) if c[0] > 0.0 else None, shape)
         delta = motion.delta(j)
         signal = -k * np.clip(delta, -0.5 * shape[0], 0.5 * shape[0])
         # As long as the gear stays on its flanks the response grows with the gap; beyond, a linear step is not followed far.
         most = max(3.0 * shape[0], 2.0 * np.abs(delta).min())
         return Screen(
-            (signal,), lambda c: np.array([np.clip(c[0] * shape[0], 0.3 * shape[0], most)]) if c[0] > 0.1 else None, shape
+            (signal,), lambda c: np.array([np.clip(c[0] * shape[0], 0.3 * shape[0], most), 0.0]) if c[0] > 0.1 else None, shape
         )
 
     return Hypothesis(
@@ -59,14 +63,17 @@ def backlash(joint: int, place: str) -> Hypothesis:
         place,
         joint,
         "spring",
-        (Parameter("gap", "rad", 1e-9, 0.5, log=True, step=1e-2),),
-        lambda p, delta, k: kernels.Law(kernels.BACKLASH, p[0], 0.0, k),
+        (
+            Parameter("gap", "rad", 1e-9, 0.5, log=True, step=1e-2),
+            Parameter("loose", "s", 0.0, MOST_DAMPING, nuisance=True, step=1e-4, center=0.0, spread=2e-3, null=0.0),
+        ),
+        lambda p, delta, k: kernels.Law(kernels.BACKLASH, p[0], k * p[1], k),
         lambda scale: [(), *((2 * f * scale.delta[2],) for f in (0.03, 0.1, 0.3, 1.0))],
         screen,
         "The gear of {joint} has a dead band of {gap:.3g} rad: its resonance drops at small amplitude wherever"
         " gravity does not preload it.",
         variable="delta",
-        options={"size": lambda s: np.array([0.5 * s.delta_rms]), "bends": True},
+        options={"size": lambda s: np.array([0.5 * s.delta_rms, 0.0]), "bends": lambda p, f, k: p * np.array([f, 1.0])},
     )
 
 
@@ -96,7 +103,12 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         "The gear of {joint} is soft about zero torque ({low_stiffness:.3g} N m/rad within"
         " {transition:.3g} rad): its resonance falls where it carries little.",
         variable="delta",
-        options={"size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms]), "bends": True},
+        options={
+            "size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms]),
+            "trivial": lambda p, k: p[0] <= SOFTEST * k,
+            # What the gear carries less beyond the transition is known best.
+            "bends": lambda p, f, k: np.array([max(k - (k - p[0]) / f, SOFTEST * k), p[1] * f]),
+        },
     )
 
 

@@ -1,0 +1,150 @@
+"""What noise of the records becomes in the torque beyond the linear arm, where a model has laws that are not linear."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.extended import (
+    Effect,
+    Prediction,
+    has_loop,
+    joints_along_record,
+    motion_per_position,
+    noise_of_motion,
+    predict_at,
+)
+from ident.hypotheses import kernels
+from ident.inverse import Motion, Solution
+from ident.records import NOISE_LINES, Group, mean_over_lines, signal_share
+
+NOISE_DRAWS = 4  # of the noise that laws of the gear answer to
+JUMP = 4.0  # power of what noise makes of a law, over that along the motion as it is, beyond which the arm jumps
+LEAST_GAIN = 1e-3  # of a gear, torque at the motor per torque in parallel with its spring, that noise is divided by
+
+
+def law_noise(pred: Prediction, group: Group) -> np.ndarray:
+    """(L, n) power that the error of the motion shown to laws at the motors leaves in the torque, N2 m2.
+
+    A friction that turns within a small velocity carries the noise of a motor that stands still
+    with the slope of the turn. By one draw, over all records, of what the motion that laws see is off.
+    """
+    out = np.zeros(pred.U.shape[1:])
+    at_motor = [e for e in pred.model.effects if e.hypothesis.channel == "motor"]
+    if not at_motor:
+        return out
+    rng = np.random.default_rng(0)
+    draw = rng.normal(size=(2, *pred.U.shape)) * np.sqrt(0.5 * group.shown_error)
+    moving = replace(group, rest=None)  # at rest the noise of the position cancels
+    seen = Motion(moving, pred.solution, pred.par)
+    motions = replace(seen, error=draw[0] + 1j * draw[1]), seen
+    for effect in at_motor:
+        j = effect.hypothesis.joint
+        off, as_seen = (effect.hypothesis.law(effect.p, x, j, pred.par.stiffness[j]) for x in motions)
+        change = pred.plane.record * pred.motion(group).lines(off - as_seen)
+        out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
+    return out
+
+
+def loop_noise(pred: Prediction, group: Group) -> np.ndarray | None:
+    """(L, n, n) covariance beyond that of the linear arm of what laws leave that move the arm; None where there are none.
+
+    A gear that is stiff now and loose then passes the noise of the position on with each in turn: what its mean slope
+    passes on is less, and at other lines. By ``NOISE_DRAWS`` over all records, of the torque at the law; no more than
+    ``JUMP`` times what it is along the motion as it is: a jump to another steady motion is no noise to bear with.
+    """
+    loops = [e for e in pred.model.effects if has_loop(e)]
+    if not loops or group.window is not None or joints_along_record(pred.model, group):
+        return None
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(NOISE_DRAWS, 2, *pred.U.shape))
+    positions = (draws[:, 0] + 1j * draws[:, 1]) * np.sqrt(0.5 * group.position_noise)
+    kept = tuple(e for e in pred.model.effects if e.hypothesis.channel not in ("motor", "drive"))
+    held = {"W": pred.solution.W, "steps": 0, "torques": pred.solution.torques}
+    arm = replace(pred.model, effects=kept), pred.structure, pred.par, pred.plane
+    moved = [predict_at(*arm, replace(group, Q=group.Q + x), pred.sampling, **held).solution for x in positions]
+    out = np.zeros((*pred.U.shape[1:], pred.U.shape[2]), complex)
+    for effect in loops:
+        at = _place_of(effect, pred, pred.solution)
+        slopes = kernels.mean_slope(at.law, group.to_time(at.motion[..., None])[..., 0])
+        slope, softened = slopes.mean(), 1.0 / (1.0 + at.compliance * slopes.mean())
+        free = at.motion + at.compliance * at.torque
+        share = signal_share(free, noise_of_motion(group, at.per_position))
+        there = share * free - at.compliance * at.torque
+        answer, (held_still, as_it_moves) = _along(at.law, group, there), np.zeros((2, len(softened)))
+        for position, solution in zip(positions, moved, strict=True):
+            step = softened * np.einsum("li,sli->sl", at.per_position, position)
+            along = _along(at.law, group, there + share * step) - answer + slopes[:, None] * (1.0 - share) * step
+            new = _place_of(effect, pred, solution).torque - at.torque
+            held_still += np.mean(np.abs(along - slope * step) ** 2, axis=0) / NOISE_DRAWS
+            as_it_moves += np.mean(np.abs((new - slope * step) / softened) ** 2, axis=0) / NOISE_DRAWS
+        power = np.minimum(*(f * mean_over_lines(x, NOISE_LINES) for f, x in ((JUMP, held_still), (1.0, as_it_moves))))
+        passed = (pred.plane.record * softened)[:, None] * pred.filters[0] * at.per_torque
+        out += power[:, None, None] * passed[:, :, None] * passed[:, None, :].conj()
+    return out
+
+
+def record_noise(pred: Prediction, group: Group) -> np.ndarray | None:
+    """(L, n, n) covariance beyond that of the linear arm where gears answer to the recorded torque; None where none does.
+
+    Of all that noise leaves through laws, those at the motors too: by ``NOISE_DRAWS`` over all records.
+    """
+    joints = sorted(joints_along_record(pred.model, group))
+    if not joints:
+        return None
+    rng = np.random.default_rng(0)
+    # Taken off before the mean over lines, and put back: the gain of a gear is sharp at its resonance.
+    passed = np.ones(pred.U.shape[1:])
+    for j in joints:
+        passed[:, j] = np.maximum(np.abs(pred.plane.spring_gain[:, j, j]), LEAST_GAIN)
+    more = np.zeros((*passed.shape, passed.shape[1]), complex)
+    for _ in range(NOISE_DRAWS):
+        draw = rng.normal(size=(4, *pred.U.shape))
+        position = (draw[0] + 1j * draw[1]) * np.sqrt(0.5 * group.position_noise)
+        torque = (draw[2] + 1j * draw[3]) * np.sqrt(0.5 * group.torque_noise)
+        moved = replace(group, Q=group.Q + position, U=group.U + torque)
+        there = predict_at(
+            pred.model, pred.structure, pred.par, pred.plane, moved, pred.sampling, W=pred.solution.W, steps=0
+        )
+        linear = torque - np.einsum("lij,slj->sli", pred.sampled_impedance, position)
+        for x, sign in ((torque + pred.U - there.U, 1.0), (linear, -1.0)):
+            more += sign * np.einsum("sli,slj->lij", x / passed, x.conj() / passed) / len(x) / NOISE_DRAWS
+    return passed[:, :, None] * mean_over_lines(more, NOISE_LINES) * passed[:, None, :]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a law moves the arm by which it is moved: a gear, or a link.
+
+    Attributes:
+        law: that acts there.
+        motion, torque: (S, L) deflection of the gear or position of the link, rad, and torque of all laws there, N m.
+        compliance: (L,) of the arm there, rad per N m; per_position: (L, n) motion there per motor position;
+        per_torque: (L, n) motor torque per torque there.
+    """
+
+    law: kernels.Law
+    motion: np.ndarray
+    torque: np.ndarray
+    compliance: np.ndarray
+    per_position: np.ndarray
+    per_torque: np.ndarray
+
+
+def _place_of(effect: Effect, pred: Prediction, solution: Solution) -> _Place:
+    """That of an effect in a model, as it moves in a solution."""
+    plane, h, j = pred.plane, effect.hypothesis, effect.hypothesis.joint
+    c, gear = pred.structure.driven[j], h.channel != "link"
+    compliance, moved = plane.A_inv[:, c, c], motion_per_position(pred.structure, pred.par, plane, j, gear=gear)
+    if gear:
+        law, torque = h.law(effect.p, None, pred.par.stiffness[j]), solution.torques.spring[..., j]
+        return _Place(law, solution.delta[..., j], torque, compliance, moved, plane.spring_gain[:, :, j])
+    law, torque = h.options["loop"](effect.p), solution.torques.link[..., c]
+    return _Place(law, solution.Q_driven[..., j], torque, compliance, moved, plane.link_gain[:, :, c])
+
+
+def _along(law: kernels.Law, group: Group, motion: np.ndarray) -> np.ndarray:
+    """Spectrum (S, L) of the torque of a law along a motion (S, L) as it is."""
+    x, rate = (group.to_time((s * motion)[..., None])[..., 0] for s in (1.0, 1j * group.omega))
+    return group.to_lines(kernels.along_motion(law, x, rate)[..., None])[..., 0]
