@@ -10,7 +10,7 @@ import scipy.stats
 
 from ident.extended import Effect, Model
 from ident.graybox import Parameters
-from ident.torque_fit import ANNEALING, Fit, Problem, anneal
+from ident.torque_fit import ANNEALING, Fit, Problem, anneal, fit
 
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom up to which the estimate of the noise may be short of it
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
@@ -18,6 +18,7 @@ DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive amo
 ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
+LAST_STEPS = 8  # at most, under the noise that the baseline sees itself
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 
 
@@ -60,7 +61,9 @@ def fit_baseline(
         # Where they only go astray elsewhere they stand for what is missing.
         if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
             best = other
-    return replace(best, softer=first.softer)
+    # Its weights are those of a model on the way, which passes on another noise.
+    last = fit(problem, best.model, iterations=LAST_STEPS, remainders=best.remainders, progress=progress)
+    return replace(last, softer=first.softer)
 
 
 def astray(problem: Problem, result: Fit) -> np.ndarray:

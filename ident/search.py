@@ -24,8 +24,8 @@ from ident.torque_fit import (
     Problem,
     Weights,
     anneal,
+    fair_costs,
     fit,
-    joint_costs,
     make_weights,
     noise_costs,
     predictions,
@@ -199,7 +199,7 @@ def under_noise_of_best(
 def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
     """A fit as it stands, its cost under other weights."""
     preds = predictions(problem, result.model, result.remainders)
-    return replace(result, costs=joint_costs(problem, preds, weights), weights=weights)
+    return replace(result, costs=fair_costs(problem, preds, weights, result.share), weights=weights)
 
 
 def explore(

@@ -98,10 +98,15 @@ class Problem:
 
 @dataclass(frozen=True)
 class Weights:
-    """(K, n + M, n + M) whitening per group: real and imaginary parts of residuals have unit variance under noise."""
+    """(K, n + M, n + M) whitening per group: real and imaginary parts of residuals have unit variance under noise.
+
+    ``by_noise``: (n,) what the scatter between periods says that noise adds to the cost of the model that they were made
+    with, by joint; None where it says nothing.
+    """
 
     whiten: tuple[np.ndarray, ...]
     covariance: tuple[np.ndarray, ...]
+    by_noise: np.ndarray | None = None
 
     def apply(self, g: int, X: np.ndarray) -> np.ndarray:
         """Whiten outputs (S, K, n + M) or (S, K, n + M, p), complex as given."""
@@ -116,7 +121,8 @@ class Fit:
 
     Attributes:
         model: chain, parameters and effects at the minimum.
-        costs: (n,) whitened sum of squares by joint, prior excluded.
+        costs: (n,) whitened sum of squares by joint, prior excluded; of noise as much as the model of the weights has
+            (``fair_costs``).
         counts: (n,) real data that entered.
         information: (p, p) of the data on the fitted coordinates, prior excluded; their normal matrix where the noise of the
             position counts for nothing.
@@ -125,6 +131,7 @@ class Fit:
         weights: under which it was made.
         converged: whether the step criterion was met.
         softer: fits with more error added to the noise that led to this one, if they are known.
+        share: of what noise adds to the cost, that was taken off.
     """
 
     model: Model
@@ -136,6 +143,7 @@ class Fit:
     weights: Weights
     converged: bool
     softer: tuple[Fit, ...] = ()
+    share: float = 0.0
 
     @property
     def cost(self) -> float:
@@ -251,7 +259,9 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
         root[0] /= np.sqrt(2.0)
         whiten.append(root)
         covariance.append(S)
-    return Weights(tuple(whiten), tuple(covariance))
+    weights = Weights(tuple(whiten), tuple(covariance))
+    known = has_scatter(problem, predictions[0].model)
+    return replace(weights, by_noise=by_noise(problem, predictions, weights)) if known else weights
 
 
 def _signals(group: Group, prediction: Prediction) -> np.ndarray:
@@ -632,7 +642,7 @@ def fit(
             share = trusted_share(H, shared_information(problem, model, preds, weights))
         if share:
             b = b - share * shared_slope(problem, model, preds, weights)
-        by_noise = share * scatter_cost(problem, preds, weights) if share else 0.0
+        noise = share * np.sum(by_noise(problem, preds, weights)) if share else 0.0
         H_p, b_p = H + np.diag(prior), b - prior * off
         size = np.diag(H_p).copy()
         size[size <= 0] = 1.0
@@ -647,10 +657,10 @@ def fit(
                 trial = unpack(model, x + step, limit)
                 new = predictions(problem, trial, Ws, steps=REMAINDER_STEPS if anew or fine else 0, near=preds)
                 new_cost = weighted_cost(problem, new, weights)
-                new_noise = share * scatter_cost(problem, new, weights) if share else 0.0
+                new_noise = share * np.sum(by_noise(problem, new, weights)) if share else 0.0
             except (np.linalg.LinAlgError, FloatingPointError, ValueError):
                 new_cost = new_noise = np.inf
-            gain = (cost - by_noise) - (new_cost - new_noise) if np.isfinite(new_cost) else -np.inf
+            gain = (cost - noise) - (new_cost - new_noise) if np.isfinite(new_cost) else -np.inf
             penalty = np.sum(prior * ((off + step) ** 2 - off**2))
             foretold = float(2.0 * b @ step - step @ H @ step)
             improved = bool(gain > penalty)
@@ -690,7 +700,9 @@ def fit(
     H, _ = _normal(problem, columns, preds, weights)
     if share:
         H = information_left(H, share * shared_information(problem, model, preds, weights))
-    return Fit(model, joint_costs(problem, preds, weights), data_counts(problem), H, coordinate_names(model), tuple(Ws), weights, converged)
+    costs = fair_costs(problem, preds, weights, share)
+    names = coordinate_names(model)
+    return Fit(model, costs, data_counts(problem), H, names, tuple(Ws), weights, converged, share=share)
 
 
 Settled = tuple[Model, list[Prediction], list[np.ndarray], float]
@@ -827,10 +839,25 @@ def has_scatter(problem: Problem, model: Model) -> bool:
     return all(g.scatter is not None and not joints_along_record(model, g) for g in problem.groups)
 
 
-def scatter_cost(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> float:
-    """What noise adds to ``weighted_cost`` (``errors_in_variables``)."""
+def by_noise(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """(n,) what noise adds to ``joint_costs`` (``errors_in_variables``)."""
     each = zip(problem.groups, preds, weights.whiten, strict=True)
-    return float(sum(np.sum(scatter_costs(*of)) for of in each))
+    return sum(scatter_costs(*of) for of in each)
+
+
+def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights, share: float) -> np.ndarray:
+    """(n,) costs by joint as they would be with as much noise as the model of the weights passes on.
+
+    A model that passes on less of the noise of the position, as one that is damped at its resonances does, costs less however wrong
+    it is: that is no merit, and what the scatter between periods says of it is made up for.
+
+    Args:
+        share: of that, which is trusted.
+    """
+    costs = joint_costs(problem, preds, weights)
+    if not share or weights.by_noise is None:
+        return costs
+    return costs - share * (by_noise(problem, preds, weights) - weights.by_noise)
 
 
 def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:

@@ -7,16 +7,19 @@ import pytest
 
 from ident.diagnosis import set_up
 from ident.errors_in_variables import MOST, information_left, trusted_share
-from ident.extended import Effect, Model
+from ident.extended import Effect, Model, predict
 from ident.hypotheses import catalogue
+from ident.inverse import REMAINDER_STEPS
 from ident.search import refit
 from ident.torque_fit import (
+    by_noise,
     coordinate_names,
+    fair_costs,
     fit,
+    joint_costs,
     make_weights,
     pack,
     predictions,
-    scatter_cost,
     shared_information,
     shared_slope,
     unpack,
@@ -41,7 +44,7 @@ def test_the_slope_of_what_noise_adds_is_its_derivative(identified, named):
 
     def cost(step):
         there = unpack(model, x + step, np.inf)
-        return scatter_cost(problem, predictions(problem, there, result.remainders), weights)
+        return np.sum(by_noise(problem, predictions(problem, there, result.remainders), weights))
 
     size = np.ones(len(x))
     size[coordinate_names(model).index("timing")] = problem.sampling.sample_time
@@ -50,12 +53,18 @@ def test_the_slope_of_what_noise_adds_is_its_derivative(identified, named):
     assert -2.0 * slope * size == pytest.approx(numeric, rel=5e-3, abs=2e-4 * np.abs(numeric).max())
 
 
-def test_noise_of_the_position_moves_no_parameter(ur10, monkeypatch):
-    """At ten times the noise of the arm errors are as large as their deviations say; of plain least squares, twice that."""
+@pytest.fixture(scope="module")
+def noisy(ur10):
+    """(problem, true parameters) at ten times the noise of the arm."""
     drives = draw_drives(np.random.default_rng(6), ur10)
     problem = set_up(run_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0)).problem
     names = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
-    truth = replace(problem.nominal, **{mine: drives[its] for mine, its in names.items()})
+    return problem, replace(problem.nominal, **{mine: drives[its] for mine, its in names.items()})
+
+
+def test_noise_of_the_position_moves_no_parameter(noisy, monkeypatch):
+    """At ten times the noise of the arm errors are as large as their deviations say; of plain least squares, twice that."""
+    problem, truth = noisy
 
     def off():
         found = fit(problem, Model(problem.structure, truth), iterations=40)
@@ -68,20 +77,46 @@ def test_noise_of_the_position_moves_no_parameter(ur10, monkeypatch):
     assert np.sqrt(np.mean(off() ** 2)) > 2.0 and np.abs(off()).max() > 5.0
 
 
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_the_noise_that_a_model_passes_on_counts_neither_for_nor_against_it(clean, factor):
+    """Of a stiffer and of a softer gear that is what they are off by without noise, and of plain sums of squares far from it."""
+    problem, periods, j = set_up(clean[0]).problem, 4, 3
+    group, rng = next(g for g in problem.groups if g.window is None), np.random.default_rng(1)
+    truth = Model(problem.structure, problem.nominal)
+    stiffness = np.where(np.arange(problem.structure.n) == j, factor, 1.0) * truth.par.stiffness
+    wrong = replace(truth, par=replace(truth.par, stiffness=stiffness))
+    quiet = replace(group, Q=np.concatenate([group.Q[:, :1], 1e-3 * group.Q[:, 1:]], axis=1))
+    draw = rng.normal(size=(4, len(quiet.Q), periods, *quiet.Q.shape[1:])) * (np.arange(quiet.Q.shape[1]) > 0)[:, None]
+    U, U_wrong = (predict(m, quiet, problem.sampling, steps=REMAINDER_STEPS).U for m in (truth, wrong))
+    Q = quiet.Q[:, None] + 1e-6 * (draw[0] + 1j * draw[1])
+    U_periods = U[:, None] + 1e-4 * (draw[2] + 1j * draw[3])
+    noisy = replace(quiet, Q=Q.mean(axis=1), U=U_periods.mean(axis=1), Q_periods=Q, U_periods=U_periods)
+    problem = replace(problem, groups=(noisy,))
+    preds = [predictions(problem, m, [None], REMAINDER_STEPS) for m in (truth, wrong)]
+    weights = make_weights(problem, preds[0], 0.0)
+    off = float(np.sum(np.abs(weights.apply(0, (U - U_wrong)[:, : group.n_compared])) ** 2))
+    plain, fair = (
+        float(np.diff([np.sum(of(p)) for p in preds])[0])
+        for of in (lambda p: joint_costs(problem, p, weights), lambda p: fair_costs(problem, p, weights, 1.0))
+    )
+    chance = 3.0 * 2.0 * np.sqrt(off) + 3.0 * np.sqrt(2.0 * np.sum(weights.by_noise))
+    assert abs(fair - off) < chance < 0.3 * abs(plain - off)
+
+
 def test_no_more_is_taken_off_than_leaves_information(identified):
     _, setup, result = identified
     problem = setup.problem
     preds = predictions(problem, result.model, result.remainders)
-    by_noise = shared_information(problem, result.model, preds, result.weights)
-    H, q = result.information, len(by_noise)
-    assert trusted_share(H, by_noise) == 1.0
+    taken_by_noise = shared_information(problem, result.model, preds, result.weights)
+    H, q = result.information, len(taken_by_noise)
+    assert trusted_share(H, taken_by_noise) == 1.0
     root = np.linalg.cholesky(H)
     padded = np.zeros_like(H)
-    padded[:q, :q] = by_noise
+    padded[:q, :q] = taken_by_noise
     largest = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, padded).T)).max()
-    assert trusted_share(H, 2.0 / largest * by_noise) == 0.0
+    assert trusted_share(H, 2.0 / largest * taken_by_noise) == 0.0
     for factor in (0.5 / largest, 1.0 / largest, 1.4 / largest):
-        taken = trusted_share(H, factor * by_noise) * factor * by_noise
+        taken = trusted_share(H, factor * taken_by_noise) * factor * taken_by_noise
         left = H.copy()
         left[:q, :q] -= taken
         ratio = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, left).T))
@@ -89,8 +124,8 @@ def test_no_more_is_taken_off_than_leaves_information(identified):
         kept = information_left(H, taken)
         assert np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, H - kept).T)).min() > -1e-6
     unfelt = H * np.outer(np.arange(len(H)) > 0, np.arange(len(H)) > 0)
-    assert not np.any(information_left(unfelt, 0.0 * by_noise)[0])
-    assert information_left(H, 0.0 * by_noise) == pytest.approx(H, rel=1e-6, abs=1e-6 * np.abs(H).max())
+    assert not np.any(information_left(unfelt, 0.0 * taken_by_noise)[0])
+    assert information_left(H, 0.0 * taken_by_noise) == pytest.approx(H, rel=1e-6, abs=1e-6 * np.abs(H).max())
 
 
 def test_an_effect_that_the_data_do_not_feel_is_no_candidate(identified):

@@ -66,6 +66,7 @@ from ident.torque_fit import (
     PRIOR_LOG_STD,
     RIDGE,
     Weights,
+    by_noise,
     data_counts,
     fit,
     inverse,
@@ -211,8 +212,9 @@ def test_costs_by_joint_add_up_and_a_better_fit_explains_more(identified):
     _, setup, result = identified
     preds = predictions(setup.problem, result.model, result.remainders)
     costs = joint_costs(setup.problem, preds, result.weights)
-    assert costs.shape == (6,) and costs.sum() == pytest.approx(result.cost, rel=1e-6)
-    assert weighted_cost(setup.problem, preds, result.weights) == pytest.approx(result.cost, rel=1e-6)
+    less = result.share * (by_noise(setup.problem, preds, result.weights) - result.weights.by_noise)
+    assert costs - less == pytest.approx(result.costs, rel=1e-6)
+    assert weighted_cost(setup.problem, preds, result.weights) == pytest.approx(costs.sum(), rel=1e-6)
     assert explained(result, result) == pytest.approx(0.0, abs=1e-9)
 
 
@@ -472,7 +474,7 @@ def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified,
     model = replace(result.model, effects=(Effect(named[effect, "elbow_joint"], np.array(start)),))
     found = pruned(setup.problem, polish(setup.problem, replace(result, model=model)))
     assert found.model.effects == ()
-    assert found.cost < result.cost * (1.0 + 1e-6)
+    assert found.cost < result.cost * (1.0 + 1e-5)  # each under the noise that it sees itself
 
 
 def scaled(weights, factor):
