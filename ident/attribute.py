@@ -368,7 +368,7 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
         workers.say(f"other motions: {h.effect} at {h.place}")
         again = partial(refit, problem, weights=current.weights, remainders=current.remainders)
         fits = workers.map_in_time(again, models)
-        best = min((r for r in fits if r is not None), key=lambda r: r.cost, default=current)
+        best = min((r for r in fits if r is not None and not last_is_pointless(r)), key=lambda r: r.cost, default=current)
         if best.cost < current.cost - MIN_EVIDENCE:
             current = polish(problem, best)
     return current

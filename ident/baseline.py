@@ -62,8 +62,11 @@ def fit_baseline(
         if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
             best = other
     # Its weights are those of a model on the way, which passes on another noise.
-    last = fit(problem, best.model, iterations=LAST_STEPS, remainders=best.remainders, progress=progress)
-    return replace(last, softer=first.softer)
+    try:
+        best = fit(problem, best.model, iterations=LAST_STEPS, remainders=best.remainders, progress=progress)
+    except (np.linalg.LinAlgError, ArithmeticError, ValueError):
+        pass  # drives gone astray pass on noise without bounds
+    return replace(best, softer=first.softer)
 
 
 def astray(problem: Problem, result: Fit) -> np.ndarray:

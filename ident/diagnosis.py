@@ -176,7 +176,8 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
         raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
-    return replace(setup, problem=with_measured_noise(setup.problem, result)), result
+    problem = replace(with_measured_noise(setup.problem, result), scatter_share=result.share)
+    return replace(setup, problem=problem), result
 
 
 def with_measured_noise(problem: Problem, result: Fit) -> Problem:

@@ -44,7 +44,7 @@ def scatter_slope(
 
     Args:
         baseline: of ``baseline_products``, of the first coordinates; its signals do not matter. Gears beside laws count as linear
-            here, and with their equivalent stiffness in the cost: what that leaves is far below a deviation.
+            here, and with their mean slope in the cost: what that leaves is far below a deviation.
         others: coordinates and the derivatives (K, n, n) of the impedance by them.
         count: coordinates, p.
     """

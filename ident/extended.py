@@ -443,4 +443,6 @@ def _loop(
     start = modal_state(guess, grid.omega, grid.period_time / grid.n_time, modes)
     torque = grid.to_lines(steady_loop(law, x, rate, modes, start)[..., None])[..., 0]
     slope = kernels.mean_slope(law, grid.to_time((shown - compliance * torque)[..., None])[..., 0])[:, None]
-    return torque + slope / (1.0 + slope * compliance) * (free - shown)
+    # The mean is shown as it is, and a gear within its dead band has no stiffness there to answer with.
+    torque[:, 1:] += slope / (1.0 + slope * compliance[1:]) * (free - shown)[:, 1:]
+    return torque

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from ident.extended import (
     motion_per_position,
     noise_of_motion,
     predict_at,
+    simulated_laws,
 )
 from ident.hypotheses import kernels
 from ident.inverse import Motion, Solution
@@ -60,26 +62,31 @@ def loop_noise(pred: Prediction, group: Group) -> np.ndarray | None:
     rng = np.random.default_rng(0)
     draws = rng.normal(size=(NOISE_DRAWS, 2, *pred.U.shape))
     positions = (draws[:, 0] + 1j * draws[:, 1]) * np.sqrt(0.5 * group.position_noise)
-    kept = tuple(e for e in pred.model.effects if e.hypothesis.channel not in ("motor", "drive"))
+    arm = simulated_laws(pred.model)
+    arm = replace(arm, effects=tuple(e for e in arm.effects if e.hypothesis.channel not in ("motor", "drive")))
     held = {"W": pred.solution.W, "steps": 0, "torques": pred.solution.torques}
-    arm = replace(pred.model, effects=kept), pred.structure, pred.par, pred.plane
-    moved = [predict_at(*arm, replace(group, Q=group.Q + x), pred.sampling, **held).solution for x in positions]
+    at_hand = arm, pred.structure, pred.par, pred.plane
+    moved = [predict_at(*at_hand, replace(group, Q=group.Q + x), pred.sampling, **held).solution for x in positions]
     out = np.zeros((*pred.U.shape[1:], pred.U.shape[2]), complex)
-    for effect in loops:
-        at = _place_of(effect, pred, pred.solution)
-        slopes = kernels.mean_slope(at.law, group.to_time(at.motion[..., None])[..., 0])
-        slope, softened = slopes.mean(), 1.0 / (1.0 + at.compliance * slopes.mean())
+    for place in sorted({(e.hypothesis.joint, e.hypothesis.channel) for e in loops}):
+        here = [e for e in loops if (e.hypothesis.joint, e.hypothesis.channel) == place]
+        at = _place_of(here, pred, pred.solution)
+        x = group.to_time(at.motion[..., None])[..., 0]
+        slopes = sum(kernels.mean_slope(law, x) for law in at.laws)
+        # The impedance of the linear arm holds that of gears alone.
+        slope, softened = slopes.mean() if place[1] == "spring" else 0.0, np.ones_like(at.compliance)
+        softened[1:] = 1.0 / (1.0 + at.compliance[1:] * slope)  # the mean has no noise
         free = at.motion + at.compliance * at.torque
         share = signal_share(free, noise_of_motion(group, at.per_position))
         there = share * free - at.compliance * at.torque
-        answer, (held_still, as_it_moves) = _along(at.law, group, there), np.zeros((2, len(softened)))
+        answer, (held_still, as_it_moves) = _along(at.laws, group, there), np.zeros((2, len(softened)))
         for position, solution in zip(positions, moved, strict=True):
             step = softened * np.einsum("li,sli->sl", at.per_position, position)
-            along = _along(at.law, group, there + share * step) - answer + slopes[:, None] * (1.0 - share) * step
-            new = _place_of(effect, pred, solution).torque - at.torque
+            along = _along(at.laws, group, there + share * step) - answer + slopes[:, None] * (1.0 - share) * step
+            new = _place_of(here, pred, solution).torque - at.torque
             held_still += np.mean(np.abs(along - slope * step) ** 2, axis=0) / NOISE_DRAWS
             as_it_moves += np.mean(np.abs((new - slope * step) / softened) ** 2, axis=0) / NOISE_DRAWS
-        power = np.minimum(*(f * mean_over_lines(x, NOISE_LINES) for f, x in ((JUMP, held_still), (1.0, as_it_moves))))
+        power = np.minimum(*(f * mean_over_lines(p, NOISE_LINES) for f, p in ((JUMP, held_still), (1.0, as_it_moves))))
         passed = (pred.plane.record * softened)[:, None] * pred.filters[0] * at.per_torque
         out += power[:, None, None] * passed[:, :, None] * passed[:, None, :].conj()
     return out
@@ -115,16 +122,16 @@ def record_noise(pred: Prediction, group: Group) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a law moves the arm by which it is moved: a gear, or a link.
+    """Where laws move the arm by which they are moved: a gear, or a link.
 
     Attributes:
-        law: that acts there.
+        laws: that act there.
         motion, torque: (S, L) deflection of the gear or position of the link, rad, and torque of all laws there, N m.
         compliance: (L,) of the arm there, rad per N m; per_position: (L, n) motion there per motor position;
         per_torque: (L, n) motor torque per torque there.
     """
 
-    law: kernels.Law
+    laws: tuple[kernels.Law, ...]
     motion: np.ndarray
     torque: np.ndarray
     compliance: np.ndarray
@@ -132,19 +139,19 @@ class _Place:
     per_torque: np.ndarray
 
 
-def _place_of(effect: Effect, pred: Prediction, solution: Solution) -> _Place:
-    """That of an effect in a model, as it moves in a solution."""
-    plane, h, j = pred.plane, effect.hypothesis, effect.hypothesis.joint
+def _place_of(effects: Sequence[Effect], pred: Prediction, solution: Solution) -> _Place:
+    """That of the effects at one place of a model, as it moves in a solution."""
+    plane, h, j = pred.plane, effects[0].hypothesis, effects[0].hypothesis.joint
     c, gear = pred.structure.driven[j], h.channel != "link"
     compliance, moved = plane.A_inv[:, c, c], motion_per_position(pred.structure, pred.par, plane, j, gear=gear)
     if gear:
-        law, torque = h.law(effect.p, None, pred.par.stiffness[j]), solution.torques.spring[..., j]
-        return _Place(law, solution.delta[..., j], torque, compliance, moved, plane.spring_gain[:, :, j])
-    law, torque = h.options["loop"](effect.p), solution.torques.link[..., c]
-    return _Place(law, solution.Q_driven[..., j], torque, compliance, moved, plane.link_gain[:, :, c])
+        laws = tuple(e.hypothesis.law(e.p, None, pred.par.stiffness[j]) for e in effects)
+        return _Place(laws, solution.delta[..., j], solution.torques.spring[..., j], compliance, moved, plane.spring_gain[:, :, j])
+    laws = tuple(e.hypothesis.options["loop"](e.p) for e in effects)
+    return _Place(laws, solution.Q_driven[..., j], solution.torques.link[..., c], compliance, moved, plane.link_gain[:, :, c])
 
 
-def _along(law: kernels.Law, group: Group, motion: np.ndarray) -> np.ndarray:
-    """Spectrum (S, L) of the torque of a law along a motion (S, L) as it is."""
+def _along(laws: Sequence[kernels.Law], group: Group, motion: np.ndarray) -> np.ndarray:
+    """Spectrum (S, L) of the torque of laws along a motion (S, L) as it is."""
     x, rate = (group.to_time((s * motion)[..., None])[..., 0] for s in (1.0, 1j * group.omega))
-    return group.to_lines(kernels.along_motion(law, x, rate)[..., None])[..., 0]
+    return group.to_lines(sum(kernels.along_motion(law, x, rate) for law in laws)[..., None])[..., 0]

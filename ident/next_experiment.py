@@ -152,12 +152,12 @@ def _separation(problem: Problem, option: _Option, a: Fit, b: Fit) -> float:
     a, b = (replace(x, model=simulated_laws(x.model)) for x in (a, b))  # there is no record of it yet
     try:
         preds = [predict(x.model, group, problem.sampling) for x in (a, b)]
+        here = replace(problem, groups=(group,))
+        weighted = [make_weights(here, [x], 0.0) for x in preds]
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return 0.0
-    here = replace(problem, groups=(group,))
     falls = []
-    for fit, own, other in ((a, *preds), (b, *preds[::-1])):
-        weights = make_weights(here, [own], 0.0)
+    for fit, own, other, weights in ((a, *preds, weighted[0]), (b, *preds[::-1], weighted[1])):
         change = group.observe(other.U - own.U)
         H, moment = jacobian(here, fit.model, group, own).normal(weights.whiten[0], change)
         known = fit.information + H

@@ -26,6 +26,7 @@ from ident.torque_fit import (
     anneal,
     fair_costs,
     fit,
+    joint_costs,
     make_weights,
     noise_costs,
     predictions,
@@ -199,7 +200,7 @@ def under_noise_of_best(
 def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
     """A fit as it stands, its cost under other weights."""
     preds = predictions(problem, result.model, result.remainders)
-    return replace(result, costs=fair_costs(problem, preds, weights, result.share), weights=weights)
+    return replace(result, costs=fair_costs(problem, preds, weights), weights=weights)
 
 
 def explore(
@@ -498,7 +499,8 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
 
 def excess_under(problem: Problem, joint: int, result: Fit, weights: Weights) -> float:
     """Cost of a fit at a joint under other weights, less what its own noise is in those units."""
-    return float(reweighted(problem, result, weights).costs[joint] - noise_costs(problem, result.weights, weights)[joint])
+    costs = joint_costs(problem, predictions(problem, result.model, result.remainders), weights)
+    return float(costs[joint] - noise_costs(problem, result.weights, weights)[joint])
 
 
 def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]) -> bool:

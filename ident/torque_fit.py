@@ -77,6 +77,8 @@ class Problem:
         free_timing: whether a common timing offset is fitted.
         step_std: (n,) rounding error of position in steps, rad; it repeats with the motion and does
             not average out over periods.
+        scatter_share: of what the scatter between periods says that noise adds to costs, that is taken off where these are
+            compared; that which the baseline has borne, none before it is known.
     """
 
     structure: Structure
@@ -87,6 +89,7 @@ class Problem:
     q_std: np.ndarray
     free_timing: bool = True
     step_std: np.ndarray | float = 0.0
+    scatter_share: float = 0.0
 
     @property
     def motions_alone(self) -> bool:
@@ -100,8 +103,8 @@ class Problem:
 class Weights:
     """(K, n + M, n + M) whitening per group: real and imaginary parts of residuals have unit variance under noise.
 
-    ``by_noise``: (n,) what the scatter between periods says that noise adds to the cost of the model that they were made
-    with, by joint; None where it says nothing.
+    ``by_noise``: (n,) what noise adds to the cost of the model that they were made with, by joint (``noise_of``); None
+    where the scatter between periods says nothing of it.
     """
 
     whiten: tuple[np.ndarray, ...]
@@ -131,7 +134,7 @@ class Fit:
         weights: under which it was made.
         converged: whether the step criterion was met.
         softer: fits with more error added to the noise that led to this one, if they are known.
-        share: of what noise adds to the cost, that was taken off.
+        share: of what noise adds to the cost, that was taken off on the way.
     """
 
     model: Model
@@ -187,19 +190,22 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
         q_std=problem.q_std,
         samples=problem.samples(group),
     )
-    k = np.arange(S.shape[1])
-    of_record, of_loops = record_noise(prediction, group), loop_noise(prediction, group)
+    of_record = record_noise(prediction, group)
     if of_record is None:
-        S = S.copy()
-        S[:, k, k] += law_noise(prediction, group)[: group.n_compared]
+        S = S + _of_laws(prediction, group)[: group.n_compared]
     else:
         S = _with_record(S, of_record[: group.n_compared])
-    if of_loops is not None:
-        S = S + of_loops[: group.n_compared]
     if np.any(problem.step_std):
-        variance = np.broadcast_to(np.square(problem.step_std) / problem.samples(group), k.shape)
+        variance = np.broadcast_to(np.square(problem.step_std) / problem.samples(group), S.shape[1:2])
         S += white_covariance(prediction.sampled_impedance[: group.n_compared], 0.0 * variance, variance)
     return S
+
+
+def _of_laws(prediction: Prediction, group: Group) -> np.ndarray:
+    """(L, n, n) covariance that laws which are not linear add to the noise, where none is along the record."""
+    of_motors = law_noise(prediction, group)[:, :, None] * np.eye(prediction.U.shape[-1])
+    of_loops = loop_noise(prediction, group)
+    return of_motors if of_loops is None else of_motors + of_loops
 
 
 def output_covariance(problem: Problem, group: Group, prediction: Prediction) -> np.ndarray:
@@ -260,8 +266,9 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
         whiten.append(root)
         covariance.append(S)
     weights = Weights(tuple(whiten), tuple(covariance))
-    known = has_scatter(problem, predictions[0].model)
-    return replace(weights, by_noise=by_noise(problem, predictions, weights)) if known else weights
+    if not has_scatter(problem, predictions[0].model):
+        return weights
+    return replace(weights, by_noise=noise_of(problem, predictions, weights))
 
 
 def _signals(group: Group, prediction: Prediction) -> np.ndarray:
@@ -700,7 +707,7 @@ def fit(
     H, _ = _normal(problem, columns, preds, weights)
     if share:
         H = information_left(H, share * shared_information(problem, model, preds, weights))
-    costs = fair_costs(problem, preds, weights, share)
+    costs = fair_costs(problem, preds, weights)
     names = coordinate_names(model)
     return Fit(model, costs, data_counts(problem), H, names, tuple(Ws), weights, converged, share=share)
 
@@ -845,19 +852,26 @@ def by_noise(problem: Problem, preds: Sequence[Prediction], weights: Weights) ->
     return sum(scatter_costs(*of) for of in each)
 
 
-def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights, share: float) -> np.ndarray:
+def noise_of(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """(n,) what noise adds to ``joint_costs``, by what is linear (``by_noise``) and by laws that are not."""
+    each = []
+    for group, pred, whiten in zip(problem.groups, preds, weights.whiten, strict=True):
+        K = len(whiten)
+        more = _of_laws(pred, group)[:K]
+        each.append(_records(group) * np.einsum("kij,kjl,kil->i", whiten, more, whiten.conj(), optimize=True).real)
+    return by_noise(problem, preds, weights) + _by_joint(problem, each)
+
+
+def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
     """(n,) costs by joint as they would be with as much noise as the model of the weights passes on.
 
     A model that passes on less of the noise of the position, as one that is damped at its resonances does, costs less however wrong
-    it is: that is no merit, and what the scatter between periods says of it is made up for.
-
-    Args:
-        share: of that, which is trusted.
+    it is: that is no merit, and is made up for.
     """
     costs = joint_costs(problem, preds, weights)
-    if not share or weights.by_noise is None:
+    if not problem.scatter_share or weights.by_noise is None or not has_scatter(problem, preds[0].model):
         return costs
-    return costs - share * (by_noise(problem, preds, weights) - weights.by_noise)
+    return np.maximum(costs - problem.scatter_share * (noise_of(problem, preds, weights) - weights.by_noise), 0.0)
 
 
 def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:

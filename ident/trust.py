@@ -14,7 +14,7 @@ from ident.faint import SHADOW
 from ident.hypotheses import Hypothesis
 from ident.records import Group
 from ident.search import NOT_COMPUTED, settled
-from ident.torque_fit import Fit, Problem, data_counts, make_weights, predictions, weighted_cost
+from ident.torque_fit import Fit, Problem, data_counts, fair_costs, make_weights, predictions, weighted_cost
 from ident.verdict import Gain
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
@@ -106,7 +106,8 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
     noise = max(1.0, weighted_cost(there, after, weights) / float(np.sum(data_counts(there))))
     changes = (g.observe_outputs(b.outputs(g) - a.outputs(g)) for g, a, b in zip(periodic, before, after, strict=True))
     foretold = sum(float(np.sum(np.abs(weights.apply(i, x)) ** 2)) for i, x in enumerate(changes)) / noise
-    fall = (weighted_cost(there, before, weights) - weighted_cost(there, after, weights)) / noise
+    costs = [float(np.sum(fair_costs(there, x, weights))) for x in (before, after)]
+    fall = (costs[0] - costs[1]) / noise
     return fall < min(DENIED_SHARE * foretold, foretold - CHANCE * 2.0 * np.sqrt(foretold))
 
 

@@ -91,13 +91,13 @@ def test_the_noise_that_a_model_passes_on_counts_neither_for_nor_against_it(clea
     Q = quiet.Q[:, None] + 1e-6 * (draw[0] + 1j * draw[1])
     U_periods = U[:, None] + 1e-4 * (draw[2] + 1j * draw[3])
     noisy = replace(quiet, Q=Q.mean(axis=1), U=U_periods.mean(axis=1), Q_periods=Q, U_periods=U_periods)
-    problem = replace(problem, groups=(noisy,))
+    problem = replace(problem, groups=(noisy,), scatter_share=1.0)
     preds = [predictions(problem, m, [None], REMAINDER_STEPS) for m in (truth, wrong)]
     weights = make_weights(problem, preds[0], 0.0)
     off = float(np.sum(np.abs(weights.apply(0, (U - U_wrong)[:, : group.n_compared])) ** 2))
     plain, fair = (
         float(np.diff([np.sum(of(p)) for p in preds])[0])
-        for of in (lambda p: joint_costs(problem, p, weights), lambda p: fair_costs(problem, p, weights, 1.0))
+        for of in (lambda p: joint_costs(problem, p, weights), lambda p: fair_costs(problem, p, weights))
     )
     chance = 3.0 * 2.0 * np.sqrt(off) + 3.0 * np.sqrt(2.0 * np.sum(weights.by_noise))
     assert abs(fair - off) < chance < 0.3 * abs(plain - off)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import set_up
-from ident.extended import Effect, Model, predict
+from ident.extended import Effect, Model, along_record, predict
 from ident.hypotheses import catalogue
+from ident.law_noise import loop_noise
 from ident.torque_fit import make_weights, output_error
 
 PERIODS = 4
@@ -69,3 +70,31 @@ def test_a_law_is_shown_the_signal_alone(noisy, monkeypatch):
     monkeypatch.setattr("ident.extended.signal_share", lambda X, noise: np.ones(X.shape))
     assert shown < 0.8 * off()
 
+
+
+def test_a_gear_within_its_dead_band_says_what_it_can(clean):
+    """About a vertical axis nothing holds it there: its mean is free, and so no noise of it."""
+    problem = set_up(clean[0]).problem
+    group = next(g for g in problem.groups if g.window is None)
+    h = next(h for h in catalogue(problem.structure) if h.key == ("backlash", "shoulder_pan_joint"))
+    model = Model(problem.structure, problem.nominal, (Effect(h, np.array([0.05, 0.0])),))
+    pred = predict(model, group, problem.sampling)
+    weights = make_weights(replace(problem, groups=(group,)), [pred], 0.0)
+    assert np.all(np.isfinite(pred.U)) and np.all(np.isfinite(weights.whiten[0]))
+
+
+def test_what_else_is_at_the_joint_makes_no_noise_of_the_law(noisy):
+    """A hysteresis that never yields is a spring, and a drive with an effect keeps a law that was taken along the record a loop."""
+    problem, model, groups = noisy
+    named, j = {h.key: h for h in catalogue(problem.structure)}, model.effects[0].hypothesis.joint
+    place, k = problem.structure.robot.joint_names[j], problem.nominal.stiffness[j]
+
+    def power(effects):
+        pred = predict(replace(model, effects=effects), groups[0], problem.sampling)
+        return np.mean(np.abs(loop_noise(pred, groups[0])[1:, j, j]))
+
+    (law,) = model.effects
+    constant = Effect(named["torque_constant", place], np.array([0.9]))
+    assert power((replace(law, hypothesis=along_record(law.hypothesis)), constant)) == pytest.approx(power((law, constant)), rel=1e-6)
+    spring = Effect(named["hysteresis", place], np.array([1e-3 * k, 1e6, 20.0, 0.0]))
+    assert power((law, spring)) == pytest.approx(power((law,)), rel=0.1)

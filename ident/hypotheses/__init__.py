@@ -8,6 +8,7 @@ from ident.graybox import Structure
 from ident.hypotheses import drive, friction, sensing, structure, transmission
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 
+LEAST_DAMPING = 1e-6  # s, of a gear, over its stiffness
 PER_JOINT = (
     friction.coulomb_friction,
     friction.stribeck_friction,
@@ -21,7 +22,6 @@ PER_JOINT = (
     drive.torque_saturation,
     transmission.hardening_stiffness,
     transmission.softening_stiffness,
-    transmission.backlash,
     transmission.hysteresis,
     transmission.transmission_error,
     structure.gravity_spring,
@@ -46,6 +46,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     out: list[Hypothesis] = []
     for j, name in enumerate(names):
         out += [make(j, name) for make in PER_JOINT]
+        out.append(transmission.backlash(j, name, max(robot.joints[j].damping / robot.joints[j].stiffness, LEAST_DAMPING)))
         out.append(structure.dress_pack(j, name, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.rising_friction(j, name))

@@ -12,7 +12,6 @@ from ident.hypotheses.yielding import elastoplastic
 from ident.inverse import Motion
 
 ROUNDED = 5.0  # exponent of a hysteresis before the data
-MOST_DAMPING = 0.02  # s, of a gear, over its stiffness
 SOFTEST = 0.05  # share of its stiffness that a soft middle keeps at least: with less it is a dead band
 
 
@@ -38,10 +37,13 @@ def hardening_stiffness(joint: int, place: str) -> Hypothesis:
     )
 
 
-def backlash(joint: int, place: str) -> Hypothesis:
+def backlash(joint: int, place: str, damping_time: float) -> Hypothesis:
     """Dead band of width ``gap`` in the gear's deflection.
 
     Within it the gear's damper acts as outside, or is ``loose`` as its spring is: a part of it, as a time constant of the spring.
+
+    Args:
+        damping_time: nominal damping of the gear over its stiffness, s; what is loose is no more.
     """
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
@@ -65,7 +67,7 @@ def backlash(joint: int, place: str) -> Hypothesis:
         "spring",
         (
             Parameter("gap", "rad", 1e-9, 0.5, log=True, step=1e-2),
-            Parameter("loose", "s", 0.0, MOST_DAMPING, nuisance=True, step=1e-4, center=0.0, spread=2e-3, null=0.0),
+            Parameter("loose", "s", 0.0, damping_time, nuisance=True, step=0.02 * damping_time, spread=damping_time, null=0.0),
         ),
         lambda p, delta, k: kernels.Law(kernels.BACKLASH, p[0], k * p[1], k),
         lambda scale: [(), *((2 * f * scale.delta[2],) for f in (0.03, 0.1, 0.3, 1.0))],
@@ -79,6 +81,11 @@ def backlash(joint: int, place: str) -> Hypothesis:
 
 def softening_stiffness(joint: int, place: str) -> Hypothesis:
     """Stiffness ``low_stiffness`` within ``transition`` of zero deflection, K beyond."""
+
+    def resized(p: np.ndarray, factor: float, k: float) -> np.ndarray:
+        # What the gear carries less beyond the transition is known best.
+        low = max(k - (k - p[0]) / factor, 2.0 * SOFTEST * k)
+        return np.array([low, p[1] * (k - p[0]) / (k - low)])
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         signal = -np.clip(motion.delta(j), -shape[0], shape[0])
@@ -105,9 +112,8 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         variable="delta",
         options={
             "size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms]),
-            "trivial": lambda p, k: p[0] <= SOFTEST * k,
-            # What the gear carries less beyond the transition is known best.
-            "bends": lambda p, f, k: np.array([max(k - (k - p[0]) / f, SOFTEST * k), p[1] * f]),
+            "trivial": lambda p, k: p[0] <= 1.02 * SOFTEST * k,
+            "bends": resized,
         },
     )
 
