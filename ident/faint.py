@@ -20,8 +20,8 @@ from ident.screening import Score, screen
 from ident.torque_fit import Fit, Problem, predictions
 
 SEEN = 32.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
-ALONG = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws
-BENT = 10.0  # the same at the joint of a law under which single records may be in another steady motion than the model
+ROUGH = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws, or one under which single
+# records may be in another steady motion than the model
 LINEAR = 0.3  # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
 SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 
@@ -88,9 +88,8 @@ def seen(scores: Sequence[Score], current: Fit) -> Score | None:
     """The clearest score, if noise does not come near it by chance, nor noise that was estimated too small at its joint."""
     whole = max(1.0, current.chi2_per_dof)
     by_joint = np.maximum(current.costs / np.maximum(current.counts, 1.0), whole)
-    least = SEEN * (ALONG if any(is_along_record(e.hypothesis) for e in current.model.effects) else 1.0)
-    bent = [e.hypothesis.joint for e in current.model.effects if "bends" in e.hypothesis.options]
-    by_joint[bent] *= BENT
+    rough = any(is_along_record(e.hypothesis) or "bends" in e.hypothesis.options for e in current.model.effects)
+    least = SEEN * (ROUGH if rough else 1.0)
     return next((s for s in scores if s.gain > least * _at(s.hypothesis, by_joint, whole)), None)
 
 

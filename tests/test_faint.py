@@ -10,8 +10,8 @@ from ident.attribute import LEFT_TO_DECOYS, Attribution, Round, attribute, tempe
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.diagnosis import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
-from ident.extended import Effect, along_record
-from ident.faint import ALONG, LINEAR, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
+from ident.extended import Effect, along_record, as_loop
+from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
 from ident.hypotheses import catalogue
 from ident.search import hopeful, refit
 from ident.trust import denied
@@ -121,9 +121,12 @@ def test_a_law_along_the_record_hides_more_and_its_joint(identified, hypotheses)
     along = replace(baseline, model=model)
     scores = faint_scores(setup.problem, along, hypotheses, np.zeros(6))
     assert {s.hypothesis.joint for s in scores if not s.hypothesis.on_chain} == set(range(6)) - {h.joint}
-    for factor, expected in ((1.2, False), (1.2 * ALONG, True)):
+    for factor, expected in ((1.2, False), (1.2 * ROUGH, True)):
         loud = [replace(scores[0], gain=factor * SEEN)]
         assert (seen(loud, along) is not None) is expected and seen(loud, baseline) is loud[0]
+        # As a loop too, under which single records may be in another steady motion than the model.
+        bent = replace(along, model=replace(model, effects=(Effect(as_loop(h), model.effects[0].p),)))
+        assert (seen(loud, bent) is not None) is expected
 
 
 def test_a_decoy_that_outdoes_a_faint_name_belies_no_other(identified):
