@@ -66,6 +66,7 @@ DOUBTED_LEVEL = 1e-2  # the same where the drives that fit cannot be those of th
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
+NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record, from which its loop is begun
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
@@ -204,13 +205,18 @@ def answers(found: Round, least: float = MIN_EVIDENCE) -> bool:
 
 
 def with_name(found: Round) -> Round:
-    """A round that a decoy has won which holds a law of the catalogue, won by that law.
+    """A round that a decoy has won, won by the law of the catalogue that it holds, or by one that explains nearly as much.
 
     Beside causes that are still missing what sets them apart means little: the decoy is a rival again at the end.
     """
-    first = found.candidates[0].hypothesis
-    special = first.options.get("absorbs") if first.decoy else None
-    named = [c for c in found.candidates if c.hypothesis.key == (special, first.place)]
+    best, *others = found.candidates
+    first = best.hypothesis
+    if not first.decoy or first.options.get("baseline"):
+        return found
+    named = [c for c in others if c.hypothesis.key == (first.options.get("absorbs"), first.place)]
+    if not named:
+        least = NEARLY * found.fall
+        named = [c for c in others if not c.hypothesis.decoy and found.before.cost - c.fit.cost >= least][:1]
     return replace(found, candidates=(*named, *(c for c in found.candidates if c not in named))) if named else found
 
 

@@ -136,8 +136,11 @@ def test_a_decoy_that_holds_a_law_steps_back_behind_it_and_is_told_of(named):
     rub, decoy = named["coulomb_friction", "elbow_joint"], named["unknown:position_friction", "elbow_joint"]
     elsewhere = named["coulomb_friction", "wrist_1_joint"]
 
-    def round_of(*members):
-        return Round(None, tuple(Candidate(h, None, 0.0, p) for h, p in members), (), 1.0, 1.0)
+    def round_of(*members, left=500.0):
+        """Of 1000 to explain the first leaves nothing, and the others ``left``."""
+        costs = [SimpleNamespace(cost=left * (i > 0)) for i in range(len(members))]
+        named = tuple(Candidate(h, x, 0.0, p) for (h, p), x in zip(members, costs, strict=True))
+        return Round(SimpleNamespace(cost=1000.0), named, (), 1.0, 1.0)
 
     stepped = with_name(round_of((decoy, 0.8), (elsewhere, 0.15), (rub, 0.05)))
     assert [c.hypothesis for c in stepped.candidates] == [rub, decoy, elsewhere] and outdone(stepped)
@@ -145,6 +148,13 @@ def test_a_decoy_that_holds_a_law_steps_back_behind_it_and_is_told_of(named):
     assert with_name(alone) is alone and not outdone(alone)
     clear = round_of((rub, 0.9), (decoy, 0.1))
     assert with_name(clear) is clear and not outdone(clear)
+    near = with_name(round_of((named["unknown:rising_friction", "elbow_joint"], 0.9), (rub, 0.1), left=30.0))
+    assert near.candidates[0].hypothesis is rub and outdone(near)
+
+
+def test_a_power_of_the_speed_at_its_bounds_is_the_friction_of_the_catalogue(named):
+    rising = named["unknown:rising_friction", "elbow_joint"]
+    assert [pointless(Effect(rising, np.array([1.0, e, 1e-3])), 1e4) for e in (0.2, 0.4, 0.9)] == [True, False, True]
 
 
 @pytest.mark.parametrize(

@@ -308,6 +308,8 @@ def rising_friction(joint: int, place: str) -> Hypothesis:
         lambda scale: [(e, scale.v) for e in (0.35, 0.6)],
         screen,
         "The residual torque of {joint} grows with a power of its speed below one.",
+        # At its bounds it is as good as Coulomb's, or viscous.
+        options={"trivial": lambda p, k: not 1.05 * RISING[0] < p[1] < 0.95 * RISING[1]},
     )
 
 
