@@ -10,7 +10,7 @@ import scipy.stats
 
 from ident.extended import Effect, Model
 from ident.graybox import Parameters
-from ident.torque_fit import ANNEALING, Fit, Problem, anneal, fit
+from ident.torque_fit import ANNEALING, NOT_COMPUTED, Fit, Problem, anneal, fit
 
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom up to which the estimate of the noise may be short of it
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
@@ -64,7 +64,7 @@ def fit_baseline(
     # Its weights are those of a model on the way, which passes on another noise.
     try:
         best = fit(problem, best.model, iterations=LAST_STEPS, remainders=best.remainders, progress=progress)
-    except (np.linalg.LinAlgError, ArithmeticError, ValueError):
+    except NOT_COMPUTED:
         pass  # drives gone astray pass on noise without bounds
     return replace(best, softer=first.softer)
 

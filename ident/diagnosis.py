@@ -34,9 +34,8 @@ from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, fit_rigid
-from ident.search import NOT_COMPUTED
 from ident.torque_checks import mislabelled
-from ident.torque_fit import Fit, Problem, data_count, fit, predictions
+from ident.torque_fit import NOT_COMPUTED, Fit, Problem, data_count, fit, predictions
 from ident.trust import LEFT_ERROR, denied, known_probability
 from ident.units import torque_unit
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict

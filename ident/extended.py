@@ -306,6 +306,11 @@ def is_along_record(h: Hypothesis) -> bool:
     return bool(h.options.get("along_record"))
 
 
+def has_rough_law(model: Model) -> bool:
+    """Whether a law along the record, or one under which single records may be in another steady motion, leaves more than noise itself."""
+    return any(is_along_record(e.hypothesis) or "bends" in e.hypothesis.options for e in model.effects)
+
+
 def along_record(h: Hypothesis) -> Hypothesis:
     """A law of the gear taken along the deflection that the recorded torque says.
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.stats
 
 from ident.baseline import DETECTION_EXCESS
-from ident.extended import is_along_record
+from ident.extended import has_rough_law, is_along_record
 from ident.hypotheses import Hypothesis
 from ident.screening import Score, screen
 from ident.torque_fit import Fit, Problem, predictions
@@ -88,8 +88,7 @@ def seen(scores: Sequence[Score], current: Fit) -> Score | None:
     """The clearest score, if noise does not come near it by chance, nor noise that was estimated too small at its joint."""
     whole = max(1.0, current.chi2_per_dof)
     by_joint = np.maximum(current.costs / np.maximum(current.counts, 1.0), whole)
-    rough = any(is_along_record(e.hypothesis) or "bends" in e.hypothesis.options for e in current.model.effects)
-    least = SEEN * (ROUGH if rough else 1.0)
+    least = SEEN * (ROUGH if has_rough_law(current.model) else 1.0)
     return next((s for s in scores if s.gain > least * _at(s.hypothesis, by_joint, whole)), None)
 
 

@@ -14,12 +14,13 @@ import numpy as np
 
 from ident.baseline import DETECTION_EXCESS, HOPELESS, implausible
 from ident.evidence import explained, last_is_pointless
-from ident.extended import Effect, Model, Prediction, along_record, as_loop, is_along_record
+from ident.extended import Effect, Model, Prediction, along_record, as_loop, has_rough_law, is_along_record
 from ident.hypotheses import Hypothesis
 from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import (
     ANNEALING,
+    NOT_COMPUTED,
     Fit,
     Problem,
     Weights,
@@ -41,7 +42,6 @@ FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
 STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit ends: the winner is fitted to the end
-NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
 HOPEFUL = 5  # candidates fitted further after the first steps
@@ -245,8 +245,7 @@ def explore(
         found += begun(other_bodies(found, chosen, scores))
     # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law along the
     # record, or under which a record may be in another steady motion, leaves that much itself.
-    rough_law = any(is_along_record(e.hypothesis) or "bends" in e.hypothesis.options for e in stage.model.effects)
-    unclear = stage.chi2_per_dof <= FAINT and not rough_law and left_by(found) > (DETECTION_EXCESS - 1.0) * stage.count
+    unclear = stage.chi2_per_dof <= FAINT and not has_rough_law(stage.model) and left_by(found) > (DETECTION_EXCESS - 1.0) * stage.count
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)

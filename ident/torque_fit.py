@@ -43,6 +43,7 @@ from ident.parallel import map_threads
 from ident.posture import moved_by_posture
 from ident.records import Group
 
+NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
 PRIOR_TIMING = 0.25  # of the common timing offset, samples
 TIMING_STEP = 1e-6  # s, for differences
@@ -181,8 +182,14 @@ def inverse(H: np.ndarray, ridge: float) -> np.ndarray:
     return np.linalg.inv(H / np.outer(size, size) + ridge * np.eye(len(H))) / np.outer(size, size)
 
 
-def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> np.ndarray:
-    """Covariance of the compared lines of the torque residual by noise alone; (K, n, n) N2 m2."""
+def noise_covariance(
+    problem: Problem, group: Group, prediction: Prediction, of_laws: np.ndarray | None = None
+) -> np.ndarray:
+    """Covariance of the compared lines of the torque residual by noise alone; (K, n, n) N2 m2.
+
+    Args:
+        of_laws: of ``_of_laws``, where it is known already.
+    """
     S = residual_covariance(
         group,
         prediction.sampled_impedance,
@@ -192,7 +199,7 @@ def noise_covariance(problem: Problem, group: Group, prediction: Prediction) -> 
     )
     of_record = record_noise(prediction, group)
     if of_record is None:
-        S = S + _of_laws(prediction, group)[: group.n_compared]
+        S = S + (_of_laws(prediction, group) if of_laws is None else of_laws)[: group.n_compared]
     else:
         S = _with_record(S, of_record[: group.n_compared])
     if np.any(problem.step_std):
@@ -208,9 +215,11 @@ def _of_laws(prediction: Prediction, group: Group) -> np.ndarray:
     return of_motors if of_loops is None else of_motors + of_loops
 
 
-def output_covariance(problem: Problem, group: Group, prediction: Prediction) -> np.ndarray:
+def output_covariance(
+    problem: Problem, group: Group, prediction: Prediction, of_laws: np.ndarray | None = None
+) -> np.ndarray:
     """The same of all outputs: noise of a motor position is in the torque and in what a link encoder differs by; (K, n + M, n + M)."""
-    S = noise_covariance(problem, group, prediction)
+    S = noise_covariance(problem, group, prediction, of_laws)
     n, links, samples = S.shape[-1], list(group.links), problem.samples(group)
     if not links:
         return S
@@ -248,8 +257,10 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
     the sum of their squares is that of ``data_count`` independent numbers.
     """
     whiten, covariance = [], []
-    for group, pred in zip(problem.groups, predictions, strict=True):
-        S = output_covariance(problem, group, pred)
+    known = has_scatter(problem, predictions[0].model)
+    laws = [_of_laws(pred, group) if known else None for group, pred in zip(problem.groups, predictions, strict=True)]
+    for group, pred, of_laws in zip(problem.groups, predictions, laws, strict=True):
+        S = output_covariance(problem, group, pred, of_laws)
         k = np.arange(S.shape[1])
         S[0] *= 4.0
         links = k[problem.structure.n :]
@@ -266,9 +277,7 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
         whiten.append(root)
         covariance.append(S)
     weights = Weights(tuple(whiten), tuple(covariance))
-    if not has_scatter(problem, predictions[0].model):
-        return weights
-    return replace(weights, by_noise=noise_of(problem, predictions, weights))
+    return replace(weights, by_noise=noise_of(problem, predictions, weights, laws)) if known else weights
 
 
 def _signals(group: Group, prediction: Prediction) -> np.ndarray:
@@ -852,12 +861,15 @@ def by_noise(problem: Problem, preds: Sequence[Prediction], weights: Weights) ->
     return sum(scatter_costs(*of) for of in each)
 
 
-def noise_of(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
-    """(n,) what noise adds to ``joint_costs``, by what is linear (``by_noise``) and by laws that are not."""
+def noise_of(problem: Problem, preds: Sequence[Prediction], weights: Weights, laws: Sequence[np.ndarray]) -> np.ndarray:
+    """(n,) what noise adds to ``joint_costs``, by what is linear (``by_noise``) and by laws that are not.
+
+    Args:
+        laws: of ``_of_laws``, of each group.
+    """
     each = []
-    for group, pred, whiten in zip(problem.groups, preds, weights.whiten, strict=True):
-        K = len(whiten)
-        more = _of_laws(pred, group)[:K]
+    for group, of_laws, whiten in zip(problem.groups, laws, weights.whiten, strict=True):
+        more = of_laws[: len(whiten)]
         each.append(_records(group) * np.einsum("kij,kjl,kil->i", whiten, more, whiten.conj(), optimize=True).real)
     return by_noise(problem, preds, weights) + _by_joint(problem, each)
 
@@ -871,7 +883,9 @@ def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) 
     costs = joint_costs(problem, preds, weights)
     if not problem.scatter_share or weights.by_noise is None or not has_scatter(problem, preds[0].model):
         return costs
-    return np.maximum(costs - problem.scatter_share * (noise_of(problem, preds, weights) - weights.by_noise), 0.0)
+    laws = [_of_laws(pred, group) for group, pred in zip(problem.groups, preds, strict=True)]
+    more = noise_of(problem, preds, weights, laws) - weights.by_noise
+    return np.maximum(costs - problem.scatter_share * more, 0.0)
 
 
 def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:

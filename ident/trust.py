@@ -13,8 +13,17 @@ from ident.extended import Effect, Prediction
 from ident.faint import SHADOW
 from ident.hypotheses import Hypothesis
 from ident.records import Group
-from ident.search import NOT_COMPUTED, settled
-from ident.torque_fit import Fit, Problem, data_counts, fair_costs, make_weights, predictions, weighted_cost
+from ident.search import settled
+from ident.torque_fit import (
+    NOT_COMPUTED,
+    Fit,
+    Problem,
+    data_counts,
+    fair_costs,
+    make_weights,
+    predictions,
+    weighted_cost,
+)
 from ident.verdict import Gain
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.attribute import as_loops
+from ident.attribute import as_loops, from_other_motions
 from ident.diagnosis import set_up
-from ident.extended import Effect, Model, along_record, is_along_record, joints_along_record, predict
+from ident.extended import Effect, Model, along_record, has_rough_law, is_along_record, joints_along_record, predict
 from ident.hypotheses import catalogue, kernels
 from ident.hypotheses.yielding import elastoplastic
 from ident.parallel import Workers
@@ -165,3 +165,37 @@ def test_a_gear_with_one_steady_motion_ends_as_a_loop(tmp_path, cubic):
     far = replace(along, model=replace(along.model, effects=(Effect(h, np.array([0.6 * cubic])),)))
     (law,) = as_loops(problem, far, Workers()).model.effects
     assert not is_along_record(law.hypothesis) and law.p[0] == pytest.approx(cubic, rel=0.01)
+
+
+def test_a_law_is_begun_from_other_sizes_where_it_leaves_more_than_noise(identified, monkeypatch):
+    """Between two sizes at which a record changes to another motion the cost has a minimum each: the best of them stays."""
+    _, setup, result = identified
+    problem, k = setup.problem, setup.problem.nominal.stiffness[2]
+    h = next(h for h in catalogue(problem.structure) if h.key == ("softening_stiffness", "elbow_joint"))
+    par = replace(result.model.par, stiffness=problem.nominal.stiffness)
+    model = replace(result.model, par=par, effects=(Effect(h, np.array([0.7 * k, 1e-4])),))
+    tried = []
+
+    def fitted(problem, model, weights, remainders):
+        tried.append(model.effects[0].p)
+        return replace(result, model=model, costs=result.counts * (1.2 if model.effects[0].p[1] > 1e-4 else 1.0))
+
+    monkeypatch.setattr("ident.attribute.refit", fitted)
+    monkeypatch.setattr("ident.attribute.polish", lambda problem, found: found)
+    quiet, loud = (replace(result, model=model, costs=x * result.counts) for x in (1.05, 1.5))
+    assert from_other_motions(problem, quiet, Workers()) is quiet and not tried
+    found = from_other_motions(problem, loud, Workers())
+    assert len(tried) == 2 and found.model.effects[0].p[1] < 1e-4 and found.cost < loud.cost
+    # What the gear carries less beyond the transition is the same in all of them.
+    assert [(k - low) * b for low, b in tried] == pytest.approx([0.3 * k * 1e-4] * 2, rel=1e-9)
+    along = replace(loud, model=replace(model, effects=(Effect(along_record(h), model.effects[0].p),)))
+    assert from_other_motions(problem, along, Workers()) is along
+
+
+def test_a_law_is_rough_along_the_record_or_with_several_steady_motions(identified):
+    _, setup, result = identified
+    named = {h.key: h for h in catalogue(setup.problem.structure)}
+    for effect, p, rough in (("backlash", [1e-4, 0.0], True), ("hysteresis", [1e3, 1.0, 5.0, 0.0], False)):
+        h = named[effect, "elbow_joint"]
+        assert has_rough_law(replace(result.model, effects=(Effect(h, np.array(p)),))) is rough
+        assert has_rough_law(replace(result.model, effects=(Effect(along_record(h), np.array(p)),)))

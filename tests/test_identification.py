@@ -14,7 +14,7 @@ from ident.gain import segment_errors
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
 from ident.screening import screen
-from ident.torque_fit import SLIGHT, fit, jacobian, output_error, pack, predictions, unpack
+from ident.torque_fit import SLIGHT, fit, jacobian, joint_costs, make_weights, output_error, pack, predictions, unpack
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
@@ -216,3 +216,11 @@ def test_columns_beside_a_loop_serve_as_long_as_they_foretell_the_cost(panda_pro
     assert some < 0.8 * every
     assert kept.cost - fresh.cost < SLIGHT
     assert fitted(LAG, [2e-3])[1] == plain
+
+
+def test_the_baseline_is_weighted_by_the_noise_that_it_sees_itself(identified):
+    """Costs under weights of a model on the way are those of another noise."""
+    setup, result = identified[-2:]
+    preds = predictions(setup.problem, result.model, result.remainders)
+    own = joint_costs(setup.problem, preds, make_weights(setup.problem, preds, 0.0))
+    assert joint_costs(setup.problem, preds, result.weights) == pytest.approx(own, rel=0.01)

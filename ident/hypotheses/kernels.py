@@ -144,10 +144,7 @@ def mean_slope(law: Law, x: np.ndarray) -> np.ndarray:
     if law.code == LINK:
         return np.full(len(x), law.a)
     x = x - x.mean(axis=1, keepdims=True)
-    if law.code == CABLE:
-        torque = law.a * x + along_path(steps_of(x), law.k, law.b, SLIP, 0.0)
-    else:
-        torque = along_path(steps_of(x), law.a, law.b, law.exponent, law.recoil)
+    torque = along_motion(law, x, x)  # what yields sees no rate
     return np.sum(torque * x, axis=1) / np.maximum(np.sum(x**2, axis=1), 1e-300)
 
 
@@ -156,14 +153,9 @@ def along_motion(law: Law, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
     if law.code == LINK:
         return law.a * x + law.b * np.tanh(rate / law.k)
     if law.code == CABLE:
-        return law.a * x + along_path(steps_of(x), law.k, law.b, SLIP, 0.0)
+        return law.a * x + along_path(np.diff(x, axis=1, prepend=x[:, -1:]), law.k, law.b, SLIP, 0.0)
     torque = along_deflection(*law, x, np.zeros(len(x)), 0)
     return torque - law.b * rate * (np.abs(x) < 0.5 * law.a) if law.code == BACKLASH else torque
-
-
-def steps_of(x: np.ndarray) -> np.ndarray:
-    """Steps (S, T) of a periodic motion, each from the sample before."""
-    return np.diff(x, axis=1, prepend=x[:, -1:])
 
 
 @njit(cache=True, nogil=True)
