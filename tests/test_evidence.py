@@ -174,6 +174,10 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
     assert not shadowed(soft, (soft, other))
     far = round_of(named[second, "wrist_1_joint"], 100.0, 100.0 - left, joint=3)
     assert not shadowed(far, (soft, far))
+    spring = round_of(named["gravity_spring", "elbow_joint"], 1e6, 100.0)
+    assert shadowed(other, (spring, other))
+    rub = round_of(named["coulomb_friction", "elbow_joint"], 100.0, 100.0 - left)
+    assert not shadowed(rub, (spring, rub))  # what a spring lacks is no friction
 
 
 @pytest.mark.parametrize(("periods", "left", "expected"), [(3770.0, 95.0, True), (3770.0, 0.0, False), (3000.0, 95.0, False)])
