@@ -81,7 +81,8 @@ class Prediction:
     added_stiffness: np.ndarray
 
     def motion(self, group: Group) -> Motion:
-        return Motion(group, self.solution, self.par)
+        drives = [e for e in self.model.effects if e.hypothesis.channel == "drive"]
+        return Motion(group, self.solution, self.par, delivered=delivered(drives, group, self.plane))
 
     def outputs(self, group: Group) -> np.ndarray:
         """(S, L, n + M) predicted recorded torque, N m, and link positions, rad, as ``Group.outputs``."""
@@ -179,14 +180,17 @@ def predict_at(
     motor = by_channel.get("motor", [])
     along = joints_along_record(model, group)
     inner.sort(key=lambda e: e.hypothesis.joint in along and is_along_record(e.hypothesis))  # after what else is at the gear
-    react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor, along=along) if inner else None
+    drives = by_channel.get("drive", [])
+    given = delivered(drives, group, plane)
+    react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor, given=given, along=along) if inner else None
     passes = 1 if len(inner) == 1 and has_loop(inner[0]) else REACTION_STEPS
     start = torques if inner else Torques()
     solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps)
     if motor:
-        at_motors = plane.record[:, None] * _motor_torques(par, Motion(group, solution, par), motor)
+        motion = Motion(group, solution, par, delivered=given)
+        at_motors = plane.record[:, None] * _motor_torques(par, motion, motor)
         solution = replace(solution, U=solution.U + at_motors)
-    U = through_drives(by_channel.get("drive", []), Motion(group, solution, par))
+    U = through_drives(drives, Motion(group, solution, par))
     added = _added_stiffness(par, Motion(group, solution, par), by_channel.get("spring", []))
     return Prediction(model, sampling, structure, par, plane, solution, U, added)
 
@@ -197,6 +201,26 @@ def through_drives(effects: Sequence[Effect], motion: Motion) -> np.ndarray:
     for effect in effects:
         h, j = effect.hypothesis, effect.hypothesis.joint
         U[..., j] = h.law(effect.p, motion, j, motion.par.stiffness[j], U[..., j])
+    return U
+
+
+def delivered(effects: Sequence[Effect], group: Group, plane: Plane) -> np.ndarray | None:
+    """(S, L, n) torque that motors deliver by the record of a group, N m; None where none of them stands still.
+
+    That alone is what a friction at rest balances: ``through_drives``, backwards.
+
+    Args:
+        effects: of the drives.
+    """
+    if group.rest is None or not np.any(group.rest):
+        return None
+    U, motion = group.U / plane.record[:, None], Motion(group, None, None)
+    for effect in effects[::-1]:
+        h, j = effect.hypothesis, effect.hypothesis.joint
+        if "filter" in h.options:
+            U[..., j] /= h.options["filter"](effect.p, plane.s)
+        else:
+            U[..., j] -= h.law(effect.p, motion, j, 0.0, np.zeros_like(U[..., j]))
     return U
 
 
@@ -220,6 +244,7 @@ def _inner_torques(
     *,
     effects: Sequence[Effect],
     motors: Sequence[Effect],
+    given: np.ndarray | None,
     along: set[int],
 ) -> Torques:
     """Spring and link torques of effects, solved together with the arm they act on.
@@ -228,11 +253,12 @@ def _inner_torques(
     that gear, the torques of all others held; or taken along the deflection that the recorded torque says.
 
     Args:
-        effects: in the gears and on the links; motors: at the motors; along: joints that are predicted along the record.
+        effects: in the gears and on the links; motors: at the motors; given: what the motors deliver, of ``delivered``;
+            along: joints that are predicted along the record.
     """
     S, L, n = solution.Q.shape
     motor = np.zeros((S, L, n), complex)
-    motion = Motion(group, solution, par)
+    motion = Motion(group, solution, par, delivered=given)
     at_gear: dict[int, np.ndarray] = {}
     at_link: dict[int, np.ndarray] = {}
     loops = []

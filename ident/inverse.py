@@ -158,7 +158,7 @@ class Motion:
     """Time signals of a solution, made where they are asked for; each (S, T) on the group's grid.
 
     ``beside``: spectra (S, L, n) of what else acts at the motors, N m. ``error``: the same, rad, by which the position
-    that laws see is taken off.
+    that laws see is taken off. ``delivered``: the same, N m, what the motors deliver by the record; the record itself where None.
     """
 
     group: Group
@@ -166,6 +166,7 @@ class Motion:
     par: Parameters
     beside: np.ndarray | float = 0.0
     error: np.ndarray | float = 0.0
+    delivered: np.ndarray | None = None
 
     def q(self, joint: int) -> np.ndarray:
         """Motor position without lines of noise alone, rad."""
@@ -214,7 +215,8 @@ class Motion:
         linear = (s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) * x.Q[..., joint]
         carried = x.tau_s @ self.par.coupling[:, joint]
         others = self.beside[..., joint] if isinstance(self.beside, np.ndarray) else self.beside
-        left = self.group.U[..., joint] - linear - carried - others
+        given = self.group.U if self.delivered is None else self.delivered
+        left = given[..., joint] - linear - carried - others
         return self.group.to_time(left[..., None])[..., 0]
 
     @property

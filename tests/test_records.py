@@ -67,10 +67,13 @@ def test_noise_of_a_motion_costs_as_much_as_it_counts(seconds):
     assert np.mean(costs) == pytest.approx(data_count(replace(problem)), rel=0.05)
 
 
-def test_friction_at_rest_is_what_the_drive_asks_of_it(tmp_path):
-    """Moves from point to point with dwells, in each of which dry friction happens to balance another torque."""
+def moves_with_dwells(size, scale=1.0):
+    """Moves from point to point with dwells, in each of which dry friction of a ``size`` happens to balance another torque.
+
+    The torque that is recorded is the one delivered over ``scale``.
+    """
     bench, rng = load_robot("twomass"), np.random.default_rng(3)
-    size, fs, n = 0.8, 500.0, 150
+    fs, n = 500.0, 150
     u = np.arange(n) / n
     step = u**3 * (10 - 15 * u + 6 * u**2)
     angles = np.cumsum(rng.choice([-1.0, 1.0], 30) * rng.uniform(0.5, 2.0, 30))
@@ -81,16 +84,22 @@ def test_friction_at_rest_is_what_the_drive_asks_of_it(tmp_path):
     q, friction = np.concatenate(q), np.concatenate(friction)
     v, joint = np.gradient(q, 1 / fs), bench.joints[0]
     inertia = joint.motor_inertia + 0.00477
-    tau = inertia * np.gradient(v, 1 / fs) + joint.viscous_friction * v + friction + 0.02 * rng.normal(size=len(q))
+    tau = (inertia * np.gradient(v, 1 / fs) + joint.viscous_friction * v + friction) / scale + 0.02 * rng.normal(size=len(q))
     cut = 250 * 20
     motions = [
         Segment(name=name, role=role, kind="trajectory", t=np.arange(len(q[part])) / fs, tau=tau[part, None], q=q[part, None] + 1e-7 * rng.normal(size=(len(q[part]), 1)))
         for name, role, part in (("a", "identification", slice(None, cut)), ("b", "validation", slice(cut, None)))
     ]  # fmt: skip
-    data = Dataset(
+    return Dataset(
         name="moves", robot_ref="twomass", robot=bench, sample_rate=fs, joints=bench.joint_names, input_hold="none",
         q_std=np.array([1e-7]), tau_std=np.array([0.02]), controller=None, segments=tuple(motions),
     )  # fmt: skip
+
+
+def test_friction_at_rest_is_what_the_drive_asks_of_it():
+    size = 0.8
+    data = moves_with_dwells(size)
+    cut = data.segments[0].n_samples
     assert np.mean(set_up(data).problem.groups[0].rest[:cut]) == pytest.approx(0.4, abs=0.1)
     verdict = diagnose(data, max_causes=2)
     assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("coulomb_friction", "drive")]
@@ -104,6 +113,21 @@ def test_friction_at_rest_is_what_the_drive_asks_of_it(tmp_path):
     parts = stretch_squares(group, lines, 8)
     assert parts.shape == (8, 1) and parts.mean(axis=0) == pytest.approx(mean_squares(np.abs(lines) ** 2)[0], rel=1e-9)
 
+
+@pytest.mark.parametrize("scale", [0.5, 1.6])
+def test_friction_at_rest_balances_what_the_drive_delivers(scale):
+    """A drive that delivers another torque than is recorded: at the true figures no more is left than with a right one."""
+
+    def left(scale):
+        setup = set_up(moves_with_dwells(0.8, scale))
+        problem, (group,) = setup.problem, setup.problem.groups
+        known = {h.effect: h for h in catalogue(problem.structure)}
+        effects = [Effect(known["coulomb_friction"], np.array([0.8, 0.0, 1e-3]))]
+        effects += [Effect(known["torque_constant"], np.array([scale]))] if scale != 1.0 else []
+        found = predict(Model(problem.structure, problem.nominal, tuple(effects)), group, problem.sampling)
+        return float(np.sqrt(np.mean(np.abs(group.observe(group.U - found.U)) ** 2)))
+
+    assert left(scale) < 1.2 * max(left(1.0), left(1.0) / scale)
 
 def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     """A motion that is cut while the torque rises: its return swings far beyond, and was never asked of the motor."""
