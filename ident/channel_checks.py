@@ -262,6 +262,8 @@ def _torque_columns(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.nd
 
 def _shift(A: np.ndarray, slope: np.ndarray, y: np.ndarray) -> float:
     """Least-squares coefficient of ``slope`` beside the columns ``A``."""
+    if not A.size:
+        return 0.0
     U, sv, _ = np.linalg.svd(A, full_matrices=False)
     U = U[:, sv > RANK * sv[0]]
     own = slope - U @ (U.T @ slope)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -392,8 +393,11 @@ def show(folder: Path) -> None:
 
 
 def _check_out(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise DataError("--out", str(out), "a file", "a folder")
+    there = next(p for p in (out, *out.absolute().parents) if p.exists())
+    if not there.is_dir():
+        raise DataError("--out", str(out), "a file" if there == out else f"{there}, which is a file", "a folder")
+    if not os.access(there, os.W_OK):
+        raise DataError("--out", str(out), f"{there}, in which nothing can be written", "a folder")
 
 
 def _print(data: dict[str, Any], json_: bool, text: str) -> None:

@@ -246,7 +246,7 @@ def _cause(
     own = sum(c.probability for c in same) if candidates else 1.0
     others: dict[tuple[str, str], float] = {}
     for c in candidates:
-        if c not in same and c.probability > 1e-3:
+        if all(c is not x for x in same) and c.probability > 1e-3:
             name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
             others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
     parameters = reported_parameters(effect, final, covariance)

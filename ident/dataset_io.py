@@ -103,8 +103,11 @@ def save_dataset(dataset: Dataset, path: str | Path) -> None:
         raise DataError("output", str(path), f"{min(foreign)}, which is no part of a dataset", "a new folder or a dataset")
     for segment in dataset.segments:
         check_segment_name(segment.name, str(path))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as err:
+        raise DataError("output", str(path), err.strerror or "a place that cannot be made", "a folder that can be written") from err
     try:
         for segment in dataset.segments:
             pq.write_table(_table(segment), beside / f"{segment.name}.parquet", compression="zstd")

@@ -29,6 +29,7 @@ APART = 0.6  # correlation below which two torques have little to do with each o
 FAR = 8.0  # ratio of sizes that no error of a drive or a body explains
 ALL = 2.5  # the same, of the middle joint
 LARGE = 0.6, 2.0  # size of what is needed over what was recorded, at two joints or more, or at one
+NOTHING = 0.3  # correlation below which, at all joints, torques have nothing to do with the motion
 AGAINST = -0.2, 0.5  # correlation below and size above which one joint is enough
 BETTER = 0.5  # of the part of a torque not explained by its own joint, that another must leave at most
 
@@ -117,6 +118,8 @@ def contradictions(found: Match, joints: tuple[str, ...]) -> dict[tuple[int, str
             out[j, "sign"] = f"{named[j]} runs against what bodies and motor need, {slope[j]:.3g} times it: wrong sign?"
         elif not 1 / FAR < slope[j] < FAR:
             out[j, "size"] = f"{named[j]} is {slope[j]:.3g} times what bodies and motor need: wrong unit, torque constant or side of the gear?"
+    if not out and np.all(np.abs(own) < NOTHING) and np.all(found.size > LARGE[0]):
+        out[0, "noise"] = f"the torques have nothing to do with what the motion needs (correlation {np.abs(own).max():.2g} at most): noise, or of another run?"
     return out
 
 

@@ -820,5 +820,11 @@ def test_the_cause_between_two_joints_names_both(identified, named):
     coupled = replace(result.model, effects=(Effect(named["joint_coupling", "wrist_1_joint"], np.array([0.01])),))
     final = refit(setup.problem, coupled, result.weights, result.remainders, 1)
     cause = _cause(final.model.effects[0], [], final, final.covariance(), 1.0)
+    # The same effect tried with two shapes, and a rival.
+    rival = candidate(named["torque_delay", "wrist_1_joint"], [1e-3], [1.0]).fit
+    tried = [Candidate(final.model.effects[0].hypothesis, x, 0.0, p) for x, p in ((final, 0.6), (result, 0.1))]
+    tried.append(Candidate(named["torque_delay", "wrist_1_joint"], rival, 0.0, 0.3))
+    told = _cause(final.model.effects[0], tried, final, final.covariance(), 1.0)
+    assert told.probability == pytest.approx(0.7) and [a.effect for a in told.alternatives] == ["torque_delay"]
     assert cause.joint == "wrist_1_joint" and cause.joints == ("wrist_1_joint", "wrist_2_joint")
     assert "wrist_1_joint turns wrist_2_joint too" in cause.evidence

@@ -17,6 +17,7 @@ from robot_assets.errors import DataError
 from robot_assets.robot import ASSETS, load_robot
 
 JITTER = 0.05  # of a sample, above which time stamps are resampled
+LONGEST_GAP = 0.5  # s without a sample, at most: what happened in it cannot be made up
 LONGEST = 100  # times as many samples as the log: beyond, the unit of time is wrong
 
 
@@ -165,10 +166,10 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
     out: dict[str, np.ndarray] = {}
     length = None
     for c in m.columns:
-        x = _signal(data[c.source], c.source, c.index, path) * c.factor
-        if c.unwrap:
-            x = np.unwrap(x)
-        x = x + c.offset
+        x = _signal(data[c.source], c.source, c.index, path)
+        if c.turn is not None:
+            x = np.unwrap(x, period=c.turn)  # before the gear: a motor's encoder wraps once a turn of the motor
+        x = x * c.factor + c.offset
         for source, factor, index in c.plus:
             other = _signal(data[source], source, index, path)
             if len(other) != len(x):
@@ -215,6 +216,9 @@ def _resample(
     if stamps[-1] * rate > LONGEST * len(stamps) or stamps[-1] * rate < len(stamps) / LONGEST:
         found = f"{len(stamps)} samples over {stamps[-1]:.4g} s"
         raise DataError("time", str(path), found, f"about sample_rate = {rate:g} Hz: is the unit of time right?")
+    if step.size and step.max() > max(LONGEST_GAP, 2.0 / rate):
+        found = f"{step.max():.4g} s without a sample after {stamps[int(np.argmax(step))]:.4g} s"
+        raise DataError("time", str(path), found, f"gaps of at most {LONGEST_GAP:g} s: cut the log into two there")
     t = np.arange(int(np.floor(stamps[-1] * rate + JITTER)) + 1) / rate
     if len(t) == len(stamps) and np.all(np.abs(step * rate - 1) < JITTER):
         return channels, t

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ class Column:
         factor: everything multiplicative: unit, sign, scale, torque constant and gear ratio.
         offset: in the unit of the dataset, added last.
         index: column of a two-dimensional source, from 0.
+        turn: of the source, in its own units, by which it jumps where it wraps; None where it does not.
         plus: (source, factor, index) of further terms: gears that couple joints.
     """
 
@@ -42,7 +44,7 @@ class Column:
     factor: float
     offset: float
     index: int
-    unwrap: bool
+    turn: float | None
     plus: tuple[tuple[str, float, int], ...] = ()
 
     @property
@@ -139,6 +141,11 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
     parts = tuple(_part(entry, where) for entry in tables(multisine, "part", where))
     if multisine and not parts:
         raise DataError("[[multisine.part]]", where, "none", "the periods of at least one segment")
+    by_first = sorted(parts, key=lambda p: p.first)
+    for a, b in itertools.pairwise(by_first):
+        if b.first <= a.last and a.role != b.role:
+            found = f"period {b.first} for {a.role} and for {b.role}"
+            raise DataError("[[multisine.part]]", where, found, "held-out periods that nothing is fitted to")
     lines = multisine.get("excited_lines", [])
     if not isinstance(lines, list) or not all(isinstance(k, int) and not isinstance(k, bool) and 0 < k < 2**53 for k in lines):
         raise DataError("multisine.excited_lines", where, show(lines), "whole numbers from 1")
@@ -204,6 +211,7 @@ def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
     factor = _unit(entry.get("unit", "N m" if channel in ("tau", "r") else "rad"), key, where)
     for option in ("sign", "scale", "torque_constant"):
         factor *= number(entry, option, here, default=1.0)
+    turn = 2 * np.pi / abs(factor) if factor else None
     ratio = ratios[joint] if choice(entry, "side", here, ("link", "motor"), "link") == "motor" else 1.0
     ratio = number(entry, "gear", here, default=float(ratio))
     if ratio == 0 or factor == 0:
@@ -220,7 +228,7 @@ def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
         factor,
         number(entry, "offset", here, default=0.0),
         whole(entry, "index", here, low=0, default=joint),
-        unwrap,
+        turn if unwrap else None,
         tuple(
             (text(p, "source", here), number(p, "factor", here), whole(p, "index", here, low=0, default=joint))
             for p in tables(entry, "plus", here)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,9 @@ from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
 VALUES = "values"  # name of the whole table of a text file without a header
+LOOKED_AT = 40  # lines of a text that say its delimiter and decimal sign
+LONGEST_LINE = 1 << 20  # characters of one
+ENCODING_BYTES = 1 << 16  # of a text that say how it is encoded
 DEEPEST = 8  # structures inside structures that are looked into
 Signals = dict[str, np.ndarray]
 
@@ -79,14 +83,16 @@ def _read(path: Path, wanted: set[str] | None) -> dict[str, Any]:
 
 
 def _csv(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        first, second = file.readline(), file.readline()
+    encoding = _encoding(path)
+    with path.open(encoding=encoding, errors="replace") as file:
+        first, *rows = (file.readline(LONGEST_LINE) for _ in range(LOOKED_AT))
     if _numbers(first):
         return _text(path, wanted)
     delimiter = max(",;\t", key=first.count)
-    comma = delimiter == ";" and "," in second and "." not in second
+    comma = delimiter != "," and any("," in x for x in rows) and not any("." in x for x in rows)
     with pa.csv.open_csv(
         path,
+        read_options=pa.csv.ReadOptions(encoding="utf8" if encoding == "utf-8-sig" else encoding),
         parse_options=pa.csv.ParseOptions(delimiter=delimiter),
         convert_options=pa.csv.ConvertOptions(decimal_point="," if comma else "."),
     ) as reader:
@@ -98,6 +104,19 @@ def _csv(path: Path, wanted: set[str] | None) -> dict[str, Any]:
             for i in keep:
                 parts[names[i]].append(batch.column(i).to_numpy(zero_copy_only=False))
     return {n: np.concatenate(p) for n, p in parts.items() if p}
+
+
+def _encoding(path: Path) -> str:
+    """Of a text: UTF-16 by its mark, else UTF-8, or Latin-1 where it is none."""
+    with path.open("rb") as file:
+        head = file.read(ENCODING_BYTES)
+    if head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8-sig"
 
 
 def _text(path: Path, wanted: set[str] | None) -> dict[str, Any]:

@@ -1,0 +1,128 @@
+"""Logs as users have them: gaps, wrapped angles, other encodings, torques of another run."""
+
+import numpy as np
+import pytest
+
+from ident.convert import convert_logs
+from ident.convert.reading import list_signals
+from ident.dataset import Dataset, Segment
+from ident.diagnosis import diagnose, set_up
+from ident.torque_checks import mislabelled
+from robot_assets.errors import DataError
+from robot_assets.robot import load_robot
+from tests.test_cli import simgap as run
+
+RATE = 200.0
+
+
+def motion(seconds=20.0, seed=0):
+    """Time and a smooth angle of some radians."""
+    t = np.arange(int(seconds * RATE)) / RATE
+    rng = np.random.default_rng(seed)
+    f, phase = np.array([0.11, 0.27, 0.53, 0.9]), rng.uniform(0, 2 * np.pi, 4)
+    return t, np.sum(np.array([0.5, 0.3, 0.15, 0.08]) * np.sin(2 * np.pi * f * t[:, None] + phase), axis=1)
+
+
+def written(folder, columns, text, name="log.csv"):
+    """A log and its map; the map names the robot's only joint."""
+    rows = "\n".join(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))
+    (folder / name).write_text(",".join(columns) + "\n" + rows + "\n")
+    (folder / "map.toml").write_text(f"sample_rate = {RATE}\n{text}")
+    return folder / name, folder / "map.toml"
+
+
+def test_angles_of_a_motor_wrap_once_a_turn_of_the_motor(tmp_path):
+    _t, q = motion()
+    for unit, turn in (("rad", 2 * np.pi), ("deg", 360.0), ("rev", 1.0)):
+        wrapped = np.mod(-121.0 * q / (2 * np.pi) * turn, turn)
+        text = f'[columns]\ntau_1 = "tau"\nq_1 = {{ source = "q", unit = "{unit}", sign = -1, gear = 121, unwrap = true }}\n'
+        log, given = written(tmp_path, {"tau": 0 * q, "q": wrapped}, text)
+        found = convert_logs([log], "twomass", given).segments[0].q[:, 0]
+        assert np.allclose(found - found[0], q - q[0], atol=1e-6)
+
+
+def test_what_happened_in_a_long_gap_is_not_made_up(tmp_path):
+    t, q = motion()
+    text = '[time]\nsource = "t"\n[columns]\ntau_1 = "tau"\nq_1 = "q"\n'
+    for gap, refused in ((0.3, False), (0.7, True), (60.0, True)):
+        log, given = written(tmp_path, {"t": t + gap * (t > 5.0), "tau": q, "q": q}, text)
+        said = []
+        if refused:
+            with pytest.raises(DataError, match="without a sample after 5 s"):
+                convert_logs([log], "twomass", given)
+        else:
+            assert convert_logs([log], "twomass", given, say=said.append).segments[0].n_samples == len(t) + round(gap * RATE)
+            assert "the longest 305 ms" in said[0]
+
+
+def test_periods_that_are_held_out_are_not_fitted_to(tmp_path):
+    _t, q = motion()
+    part = "[[multisine.part]]\nfirst = {}\nlast = {}\nrole = \"{}\"\n"
+    text = '[columns]\ntau_1 = "tau"\nq_1 = "q"\n[multisine]\nperiod = 400\nexcited_lines = [3, 5]\n'
+    for first, refused in ((3, True), (5, False)):
+        both = part.format(first, 8, "validation") + part.format(1, 4, "identification")
+        log, given = written(tmp_path, {"tau": q, "q": q}, text + both)
+        if refused:
+            with pytest.raises(DataError, match="period 3 for identification and for validation"):
+                convert_logs([log], "twomass", given)
+        else:
+            assert [s.role for s in convert_logs([log], "twomass", given).segments] == ["validation", "identification"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+@pytest.mark.parametrize(("delimiter", "decimal"), [(";", ","), ("\t", ","), ("\t", "."), (",", ".")])
+def test_texts_of_other_encodings_and_decimal_signs(tmp_path, encoding, delimiter, decimal):
+    rows = [("Winkel [°]", "Moment [Nm]"), ("0", "1"), ("1.5", "-2.25"), ("2", "3e-2")] * 1
+    rows += [("4", "5")] * 20
+    text = "\n".join(delimiter.join(x.replace(".", decimal) if i else x for x in row) for i, row in enumerate(rows))
+    (tmp_path / "log.csv").write_text(text + "\n", encoding=encoding)
+    found = list_signals(tmp_path / "log.csv")
+    assert sorted(found) == ["Moment [Nm]", "Winkel [°]"]
+    assert np.allclose(found["Winkel [°]"][:3], [0.0, 1.5, 2.0]) and np.allclose(found["Moment [Nm]"][:3], [1.0, -2.25, 0.03])
+
+
+def motions(torque):
+    """A dataset of two motions of the bench whose torque is a function of inertia's share of it and a generator."""
+    bench, rng = load_robot("twomass"), np.random.default_rng(4)
+    joint, segments = bench.joints[0], []
+    for k, role in enumerate(("identification", "validation")):
+        t, q = motion(seed=k)
+        a = np.gradient(np.gradient(q, 1 / RATE), 1 / RATE)
+        tau = torque((joint.motor_inertia + 0.00477) * a, rng)
+        segments.append(Segment(f"m{k}", "trajectory", role, t, tau[:, None], q[:, None] + 1e-7 * rng.normal(size=(t.size, 1))))
+    return Dataset(
+        "moves", "twomass", bench, RATE, bench.joint_names, "none", np.array([1e-7]), np.array([1e-3]), None, tuple(segments)
+    )
+
+
+def test_torques_that_have_nothing_to_do_with_the_motion_name_no_cause():
+    size = 0.01
+
+    def noise(own, rng):
+        return size * rng.normal(size=own.size)
+
+    def right(own, rng):
+        return own + 0.1 * size * rng.normal(size=own.size)
+
+    assert not mislabelled(motions(right))
+    data = motions(noise)
+    assert any("nothing to do with" in text for text in mislabelled(data))
+    verdict = diagnose(data)
+    assert not verdict.causes and verdict.unexplained_verdict == "unknown cause remains"
+
+
+def test_a_window_is_seen_as_the_transform_sees_it():
+    (group,) = set_up(motions(lambda own, rng: own + 1e-3 * rng.normal(size=own.size))).problem.groups
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(1, len(group.omega), 3)) + 1j * rng.normal(size=(1, len(group.omega), 3))
+    seen = group.to_lines(group.to_time(X) * group.window[:, None])[:, : group.n_compared]
+    assert np.allclose(group.observe(X), seen, rtol=0, atol=1e-12 * np.abs(seen).max())
+
+
+def test_outputs_that_cannot_be_made_are_one_line(tmp_path):
+    log, given = written(tmp_path, {"tau": motion()[1], "q": motion()[1]}, '[columns]\ntau_1 = "tau"\nq_1 = "q"\n')
+    for out in (log / "sub", "/proc/none/of"):
+        result = run("convert", log, "--robot", "twomass", "--map", given, "--out", out)
+        assert result.returncode == 2 and len(result.stderr.strip().splitlines()) == 1
+        result = run("diagnose", tmp_path, "--out", out)
+        assert result.returncode == 2 and len(result.stderr.strip().splitlines()) == 1
