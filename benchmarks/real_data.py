@@ -131,7 +131,11 @@ def section(machine: Machine, result: Diagnosis, seconds: float) -> str:
         if g.gap_closed is not None and g.ci95 is not None:
             closed += f" (95 %: {g.ci95[0]:.1%} to {g.ci95[1]:.1%})"
         unit = torque_unit(result.robot)
-        lines += [f"Error on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} {unit}{closed}; noise {g.noise_floor:.2g}.", ""]
+        of = f" of {', '.join(g.joints)}" if g.of_some else ""
+        lines += [f"Error{of} on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} {unit}{closed}; noise {g.noise_floor:.2g}.", ""]
+        if len(g.by_joint) > 1:
+            each = ", ".join(f"{name} {x.before:.3g} → {x.after:.3g}" for name, x in g.by_joint.items())
+            lines += [f"All joints: {g.over_all[0]:.4g} → {g.over_all[1]:.4g} {unit}; {each}.", ""]
     if v.residual_description:
         lines += [v.residual_description, ""]
     for trace in result.traces[: int(machine.picture)]:

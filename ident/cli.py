@@ -415,7 +415,10 @@ def _verdict_text(diagnosis: Diagnosis, out: Path) -> str:
         lines += [f"    or {a.effect} at {a.joint}, {a.probability:.3f}" for a in cause.alternatives]
     if verdict.gain is not None:
         g = verdict.gain
-        lines.append(f"Torque error on held-out data: {g.before:.4g} -> {g.after:.4g} {torque_unit(diagnosis.robot)}, noise {g.noise_floor:.4g}")
+        of = f" at {', '.join(g.joints)}" if g.of_some else ""
+        over_all = f"; of all joints {g.over_all[0]:.4g} -> {g.over_all[1]:.4g}" if g.of_some else ""
+        unit = torque_unit(diagnosis.robot)
+        lines.append(f"Torque error on held-out data{of}: {g.before:.4g} -> {g.after:.4g} {unit}, noise {g.noise_floor:.4g}{over_all}")
     lines.append(f"Unexplained: {verdict.unexplained_verdict} ({verdict.unexplained_share:.2%})")
     if verdict.residual_description:
         lines.append(verdict.residual_description)

@@ -10,7 +10,7 @@ import numpy as np
 from ident.extended import Model, Prediction, predict
 from ident.records import Group
 from ident.torque_fit import Problem, noise_covariance
-from ident.verdict import Gain
+from ident.verdict import Gain, JointGain
 
 METRIC = "RMS motor-torque prediction error, N m"
 STRETCHES = 8  # of a motion
@@ -93,10 +93,12 @@ def measure_gain(
     Args:
         affected: the joints over which errors are taken: those that carry the discrepancy in the
             identification data (all where there is none), so that the noise of a large joint does
-            not hide what is gained at a small one.
+            not hide what is gained at a small one. ``by_joint`` tells all of them.
     """
     if not errors.segments:
         return None
+    rows = (errors.before, errors.after, errors.noise)
+    by_joint = {name: JointGain(*(float(np.sqrt(np.mean(x[:, j]))) for x in rows)) for j, name in enumerate(joints)}
     pick_joints = list(affected) if len(affected) else list(range(len(joints)))
     n = len(pick_joints)
     errors = Errors(
@@ -115,6 +117,5 @@ def measure_gain(
         b, a, f = (np.sqrt(x[pick].mean(axis=1) / n) for x in (errors.before, errors.after, errors.noise))
         ratio = (b - a) / np.maximum(b - f, 1e-300)
         interval = tuple(float(v) for v in np.quantile(ratio, [0.025, 0.975]))
-    return Gain(
-        tuple(dict.fromkeys(errors.segments)), metric, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints)
-    )
+    told = tuple(dict.fromkeys(errors.segments))
+    return Gain(told, metric, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints), by_joint)

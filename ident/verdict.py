@@ -74,8 +74,20 @@ class Discrepancy:
 
 
 @dataclass(frozen=True)
+class JointGain:
+    """Rms prediction error of one joint on held-out segments before and after, N m, or N of a linear one."""
+
+    before: float
+    after: float
+    noise_floor: float
+
+
+@dataclass(frozen=True)
 class Gain:
-    """Prediction error on held-out segments before and after, N m."""
+    """Prediction error on held-out segments before and after, N m.
+
+    ``joints``: those over which errors are taken; ``by_joint``: all, one by one.
+    """
 
     segments: tuple[str, ...]
     metric: str
@@ -86,6 +98,19 @@ class Gain:
     ci95: tuple[float, float] | None
     method: str
     joints: tuple[str, ...] = ()
+    by_joint: dict[str, JointGain] = field(default_factory=dict)
+
+    @property
+    def over_all(self) -> tuple[float, float]:
+        """Rms error over all joints, before and after; of ``joints`` where single ones are not known."""
+        if not self.by_joint:
+            return self.before, self.after
+        return tuple(float(np.sqrt(np.mean([getattr(g, x) ** 2 for g in self.by_joint.values()]))) for x in ("before", "after"))
+
+    @property
+    def of_some(self) -> bool:
+        """Whether errors are taken over some of the joints."""
+        return 0 < len(self.joints) < len(self.by_joint)
 
 
 @dataclass(frozen=True)
