@@ -7,6 +7,8 @@ keeps the return and the first transient out of every comparison.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -267,10 +269,11 @@ def build_groups(
         raise DataError("segments", str(dataset.path or dataset.name), f"none of role {role}", "at least one")
     top = band_hz or highest_line_hz(dataset)
     motion_top = motion_band_hz or min(10.0, dataset.sample_rate / 10)
+    began = start_times(dataset)
     return tuple(
-        _motion_group(dataset, members[0], motion_top, fast)
+        _motion_group(dataset, members[0], motion_top, fast, began)
         if members[0].kind == "trajectory"
-        else _periodic_group(dataset, members, top)
+        else _periodic_group(dataset, members, top, began)
         for members in groups.values()
     )
 
@@ -285,7 +288,19 @@ def highest_line_hz(dataset: Dataset) -> float:
     return float(max(tops)) if tops else 0.2 * dataset.sample_rate
 
 
-def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) -> Group:
+def start_times(dataset: Dataset) -> dict[str, float]:
+    """When each segment began, s, by its name: as its time stamps say, or one after the other.
+
+    Where the clock was set back for a segment its stamps say nothing of when it was recorded; then the order in the dataset does.
+    """
+    segments = dataset.segments
+    if all(b.t[0] >= a.t[-1] for a, b in itertools.pairwise(sorted(segments, key=lambda s: s.t[0]))):
+        return {s.name: float(s.t[0]) for s in segments}
+    lengths = [s.n_samples / dataset.sample_rate for s in segments]
+    return dict(zip((s.name for s in segments), np.cumsum([0.0, *lengths[:-1]]).tolist(), strict=True))
+
+
+def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, began: Mapping[str, float]) -> Group:
     first = members[0]
     fs, N = dataset.sample_rate, int(first.period)
     top = min(int(np.floor(band_hz * N / fs + 1e-9)), N // 2 - 1)
@@ -314,7 +329,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float) ->
         n_time=scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True),
         window=None,
         amplitude=np.array([s.amplitude for s in members]),
-        start=np.array([s.t[0] for s in members]) + _middle_periods(members) * N / fs,
+        start=np.array([began[s.name] for s in members]) + _middle_periods(members) * N / fs,
         temperature=None if any(x is None for x in temps) else np.stack([x.mean(axis=0) for x in temps]),
         period_time=N / fs,
         periods=np.array([s.steady_periods for s in members]),
@@ -333,7 +348,7 @@ def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:
     return scipy.fft.rfft(x, axis=1, norm="forward")[:, :n_lines]
 
 
-def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool) -> Group:
+def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool, began: Mapping[str, float]) -> Group:
     fs = dataset.sample_rate
     n_return = int(np.ceil(max(RETURN_TIME, 0.05 * len(segment.t) / fs) * fs))
     N = scipy.fft.next_fast_len(len(segment.t) + n_return, real=True)
@@ -370,7 +385,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
         n_time=n_time,
         window=window,
         amplitude=np.ones(1),
-        start=segment.t[:1],
+        start=np.array([began[segment.name]]),
         temperature=None if segment.temp is None else segment.temp.mean(axis=0)[None],
         period_time=N / fs,
         periods=np.ones(1, int),

@@ -189,3 +189,14 @@ def test_what_that_leaves_in_a_friction_is_what_is_said(smoothing):
     exact = replace(motion, error=truth - group.signal_share * seen.solution.Q)
     off = motion.lines(friction.law(effect.p, motion, 0, 0.0) - friction.law(effect.p, exact, 0, 0.0))
     assert np.mean(law_noise(seen, group)) / np.mean(np.abs(off) ** 2) == pytest.approx(1.0, abs=0.3)
+
+
+def test_segments_whose_clocks_begin_anew_came_one_after_the_other():
+    data, group, _ = periodic_positions()
+    n, length = len(data.segments), data.segments[0].n_samples / RATE
+    assert np.allclose(np.diff(group.start), length)
+    # Absolute times count as they are, pauses and the order of recording too.
+    offsets = 5.0 + 40.0 * np.arange(n)[::-1]
+    late = replace(data, segments=tuple(replace(s, t=s.t + x) for s, x in zip(data.segments, offsets, strict=True)))
+    (again,) = build_groups(late)
+    assert np.allclose(again.start - group.start, offsets - length * np.arange(n))
