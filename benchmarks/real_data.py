@@ -167,7 +167,8 @@ def main() -> None:
     if not only:
         head = (
             "# Real machines\n\nWhat `simgap convert` and `simgap diagnose` make of published recordings. Errors are root mean squares"
-            " in the band that is compared, over the joints that carry most of the discrepancy as far as they are named, and over all.\nWritten by `python benchmarks/real_data.py`, commit {commit()}, two cores.\n\n"
+            " in the band that is compared, over the joints that carry most of the discrepancy as far as they are named, and over all.\n"
+            f"Written by `python benchmarks/real_data.py`, commit {commit()}, two cores.\n\n"
         )
         PAGE.write_text(head + "\n".join(parts), encoding="utf-8")
 
