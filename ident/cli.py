@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -396,8 +395,12 @@ def _check_out(out: Path) -> None:
     there = next(p for p in (out, *out.absolute().parents) if p.exists())
     if not there.is_dir():
         raise DataError("--out", str(out), "a file" if there == out else f"{there}, which is a file", "a folder")
-    if not os.access(there, os.W_OK):
-        raise DataError("--out", str(out), f"{there}, in which nothing can be written", "a folder")
+    try:
+        # Tried, since rights alone do not tell: the whole job would be done for nothing.
+        with tempfile.TemporaryDirectory(dir=there, prefix=".simgap-"):
+            pass
+    except OSError as err:
+        raise DataError("--out", str(out), f"{there}, in which nothing can be written", "a folder") from err
 
 
 def _print(data: dict[str, Any], json_: bool, text: str) -> None:

@@ -7,6 +7,7 @@ from ident.convert import convert_logs
 from ident.convert.reading import list_signals
 from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose, set_up
+from ident.gain import Errors, measure_gain
 from ident.torque_checks import mislabelled
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -72,8 +73,7 @@ def test_periods_that_are_held_out_are_not_fitted_to(tmp_path):
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
 @pytest.mark.parametrize(("delimiter", "decimal"), [(";", ","), ("\t", ","), ("\t", "."), (",", ".")])
 def test_texts_of_other_encodings_and_decimal_signs(tmp_path, encoding, delimiter, decimal):
-    rows = [("Winkel [°]", "Moment [Nm]"), ("0", "1"), ("1.5", "-2.25"), ("2", "3e-2")] * 1
-    rows += [("4", "5")] * 20
+    rows = [("Winkel [°]", "Moment [Nm]"), ("0", "1"), ("1.5", "-2.25"), ("2", "3e-2"), *[("4", "5")] * 20]
     text = "\n".join(delimiter.join(x.replace(".", decimal) if i else x for x in row) for i, row in enumerate(rows))
     (tmp_path / "log.csv").write_text(text + "\n", encoding=encoding)
     found = list_signals(tmp_path / "log.csv")
@@ -119,10 +119,20 @@ def test_a_window_is_seen_as_the_transform_sees_it():
     assert np.allclose(group.observe(X), seen, rtol=0, atol=1e-12 * np.abs(seen).max())
 
 
+def test_a_gain_of_some_joints_tells_of_all_of_them():
+    before, after, noise = (np.array([[x, 16.0], [3.0 * x, 16.0]]) for x in (2.0, 0.5, 0.125))
+    gain = measure_gain(Errors(("a", "b"), before, after, noise), ("one", "two"), [0], "method", np.random.default_rng(0))
+    assert gain.joints == ("one",) and gain.of_some and gain.before == pytest.approx(2.0) and gain.after == pytest.approx(1.0)
+    assert [(g.before, g.after) for g in gain.by_joint.values()] == [pytest.approx((2.0, 1.0)), pytest.approx((4.0, 4.0))]
+    assert gain.over_all == pytest.approx((np.sqrt(10.0), np.sqrt(8.5)))
+
+
 def test_outputs_that_cannot_be_made_are_one_line(tmp_path):
     log, given = written(tmp_path, {"tau": motion()[1], "q": motion()[1]}, '[columns]\ntau_1 = "tau"\nq_1 = "q"\n')
+    convert = ("convert", log, "--robot", "twomass", "--map", given, "--out")
+    assert run(*convert, tmp_path / "d").returncode == 0
     for out in (log / "sub", "/proc/none/of"):
-        result = run("convert", log, "--robot", "twomass", "--map", given, "--out", out)
-        assert result.returncode == 2 and len(result.stderr.strip().splitlines()) == 1
-        result = run("diagnose", tmp_path, "--out", out)
-        assert result.returncode == 2 and len(result.stderr.strip().splitlines()) == 1
+        for command, at_fault in ((convert, "output"), (("diagnose", tmp_path / "d", "--out"), "--out")):
+            result = run(*command, out)
+            (line,) = result.stderr.strip().splitlines()
+            assert result.returncode == 2 and at_fault in line and str(out) in line

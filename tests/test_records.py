@@ -129,6 +129,7 @@ def test_friction_at_rest_balances_what_the_drive_delivers(scale):
 
     assert left(scale) < 1.2 * max(left(1.0), left(1.0) / scale)
 
+
 def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     """A motion that is cut while the torque rises: its return swings far beyond, and was never asked of the motor."""
     bench, fs = load_robot("twomass"), RATE
