@@ -15,6 +15,7 @@ from ident.graybox import INERTIAL, Structure
 from ident.hypotheses import Hypothesis
 from ident.link_sensor import LinkDelay
 from ident.next_experiment import NextExperiment, advice
+from ident.noise import drifting
 from ident.quantization import Steps
 from ident.reporting import describe, where
 from ident.rigid import RigidFit
@@ -127,6 +128,7 @@ def conclude(
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
             *faint_note(result),
+            *drift_note(problem),
             *(belied_note(e) for e in named_effects(final) if e.hypothesis.key in belied),
             *(nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy),
             *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
@@ -190,6 +192,18 @@ def faint_note(result: Attribution) -> tuple[str, ...]:
     return (
         f"The model leaves {result.baseline.chi2_per_dof:.3g} times the power of the noise that was estimated: more than chance"
         f" (p = {result.p_value:.1g}), but up to {DETECTION_EXCESS:g} times may be an error of that estimate.",
+    )
+
+
+def drift_note(problem: Problem) -> tuple[str, ...]:
+    """What does not repeat from period to period, and is no noise of samples, in a sentence; nothing where nothing does."""
+    names = problem.structure.robot.joint_names
+    joints = [name for name, x in zip(names, drifting(problem.groups), strict=True) if x]
+    if not joints:
+        return ()
+    return (
+        f"At {', '.join(joints)} periods differ by more than noise of the samples: a drift, a transient or a disturbance of its"
+        " own. None of the effects that are sought does that, and no faint one is named there.",
     )
 
 

@@ -16,6 +16,7 @@ import scipy.stats
 from ident.baseline import DETECTION_EXCESS
 from ident.extended import has_rough_law, is_along_record
 from ident.hypotheses import Hypothesis
+from ident.noise import drifting
 from ident.screening import Score, screen
 from ident.torque_fit import Fit, Problem, predictions
 
@@ -49,7 +50,7 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
     """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
 
     None where the noise is not measured by the scatter between periods, nor beside link encoders, of which the weights follow
-    what the model leaves. None at the joint of a law along the record, which turns noise into a signal of its own there.
+    what the model leaves. None where periods drift, at that joint or of the whole chain: a few numbers explain much of such noise. None at the joint of a law along the record, which turns noise into a signal of its own there.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.
@@ -58,7 +59,10 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
     if not measured:
         return []
     along = {e.hypothesis.joint for e in current.model.effects if is_along_record(e.hypothesis)}
-    hypotheses = [h for h in hypotheses if h.on_chain or h.joint not in along]
+    drift = set(np.flatnonzero(drifting(problem.groups)))
+    hypotheses = [h for h in hypotheses if (not drift if h.on_chain else h.joint not in along | drift)]
+    if not hypotheses:
+        return []
     at_joints = left_by_laws(current, told)
     scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
     return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]

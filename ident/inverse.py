@@ -14,7 +14,7 @@ torque in parallel with a spring, ``L`` one on the link side, ``F`` one at the m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,6 +38,7 @@ from ident.recursion import chain_of, newton_euler
 
 REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
+STALL_STEPS = 12  # in which the change must halve: where no motion repeats the search for one does not end
 NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
 REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
 REACTION_CHANGE = 1e-5  # relative change that ends them
@@ -326,7 +327,7 @@ def solve(
         W, enough = static_remainder(structure, par, plane, group), REMAINDER_CHANGE
     if react is not None:
         torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-    left, past = np.arange(len(W)), []
+    left, past, changes = np.arange(len(W)), [], []
     for _ in range(steps):
         Q_a = link_motion(structure, par, plane, Q, W, torques)
         change = geometric_remainder(structure, plane, group, Q_a) - W
@@ -338,12 +339,20 @@ def solve(
         W[left] = mixed(past)
         if react is not None:
             torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-        moving = np.abs(change[left]).max(axis=(1, 2)) > enough * np.abs(W).max()
-        if not np.any(moving):
+        off = np.abs(change[left]).max(axis=(1, 2)) / np.abs(W).max()
+        moving = off > enough
+        changes.append(off.max())
+        if not np.any(moving) or stalled(changes):
             break
         if not np.all(moving):
             left, past = left[moving], [(x[moving], f[moving]) for x, f in past]
     return _solution(structure, par, plane, Q, W, torques)
+
+
+def stalled(changes: Sequence[float]) -> bool:
+    """Whether the last ``STALL_STEPS`` changes of a search for a fixed point have none below half of all before."""
+    last, before = changes[-STALL_STEPS:], changes[:-STALL_STEPS]
+    return len(before) >= STALL_STEPS and min(last) > 0.5 * min(before)
 
 
 def _settle(

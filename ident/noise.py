@@ -8,6 +8,8 @@ weight that makes torque-residual matching the maximum-likelihood form of FRF ma
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.optimize
 
@@ -15,6 +17,8 @@ from ident.records import Group, mean_over_lines
 
 PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
+BAND_LINES = 20  # of a band in which the coherence of neighbouring lines is taken
+TOGETHER, NO_CHANCE = 0.8, 5.0  # coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
 
 
 def white_covariance(Z: np.ndarray, tau_var: np.ndarray, q_var: np.ndarray) -> np.ndarray:
@@ -113,3 +117,41 @@ def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean over lines k-half..k+half, and how many lines entered."""
     k = np.arange(len(x))
     return mean_over_lines(x, half), np.minimum(k + half + 1, len(x)) - np.maximum(k - half, 0)
+
+
+def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Coherence of what differs between periods from each line to the next.
+
+    Noise that is stationary over many periods has independent lines (Pintelon and Schoukens 2012, ch. 2): the coherence is about the
+    inverse root of the number of pairs then. What ends a period elsewhere than it began it, as a drift does, steps there: its lines
+    go together, as far up as they are above the other noise. A random walk has about a third, and so has what is left of a transient.
+
+    Args:
+        periods: spectra (S, P, L, n) of single periods by group, the mean left out.
+
+    Returns:
+        (bands, n) coherence, 0 to 1, over bands of ``BAND_LINES``, and (bands,) the number of pairs of lines in each.
+    """
+    bands = max(X.shape[2] for X in periods) // BAND_LINES + 1
+    n = periods[0].shape[-1]
+    joint, power, count = np.zeros((bands, n), complex), np.zeros((bands, n)), np.zeros(bands)
+    for X in periods:
+        d = X - X.mean(axis=1, keepdims=True)
+        d = d / np.sqrt(np.maximum(np.mean(np.abs(d) ** 2, axis=(0, 1)), 1e-300))
+        of = np.arange(d.shape[2] - 1) // BAND_LINES
+        np.add.at(joint, of, np.sum(d[:, :, 1:] * d[:, :, :-1].conj(), axis=(0, 1)))
+        np.add.at(power, of, np.sum(np.abs(d[:, :, 1:]) ** 2, axis=(0, 1)))
+        np.add.at(count, of, len(d) * (d.shape[1] - 1))
+    return np.abs(joint) / np.maximum(power, 1e-300), count
+
+
+def drifting(groups: Sequence[Group]) -> np.ndarray:
+    """Joints (n,) at which nearly all that differs between periods, of the torque or of the position in some band, is a drift."""
+    measured = [g for g in groups if g.window is None and g.U_periods.shape[1] > 1]
+    out = np.zeros(groups[0].U.shape[-1], bool)
+    if not measured:
+        return out
+    for channel in ("U_periods", "Q_periods"):
+        together, count = line_coherence([getattr(g, channel)[:, :, 1 : g.n_compared] for g in measured])
+        out |= np.any((together > TOGETHER) & (together * np.sqrt(count)[:, None] > NO_CHANCE), axis=0)
+    return out

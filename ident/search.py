@@ -226,11 +226,12 @@ def explore(
     answered = bool(scores) and scores[0].gain >= least * excess
 
     def started(score: Score) -> Fit | None:
-        # Where the data are followed, a start that has lost them was a step that is not linear. A hinge that stands
-        # anywhere begins off them, and what answers best is tried from anywhere.
-        followed = stage.chi2_per_dof <= FAINT and "hinge" not in score.hypothesis.options and score.gain < scores[0].gain
-        most = STRONG * stage.count if followed else np.inf
-        return refit(problem, begin(problem, stage, score), stage.weights, stage.remainders, FIRST_STEPS, most)
+        # A start that has lost the data was a step that is not linear, and a gear that hits one end of its dead band after
+        # the other takes minutes to fit. A hinge that stands anywhere begins off them, and what answers best is tried from anywhere.
+        anywhere = "hinge" in score.hypothesis.options or score.gain >= scores[0].gain
+        most = np.inf if anywhere else STRONG * (stage.count if stage.chi2_per_dof <= FAINT else stage.cost)
+        model, cost = begin(problem, stage, score)
+        return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most) if anywhere or cost <= most else None
 
     def finished(result: Fit) -> Fit:
         return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
@@ -255,8 +256,8 @@ def explore(
     return sorted(found, key=lambda x: x[1].cost), scores
 
 
-def begin(problem: Problem, stage: Fit, score: Score) -> Model:
-    """The model with a screened hypothesis, what is fitted already as it is or after the step that goes with it: whichever costs less.
+def begin(problem: Problem, stage: Fit, score: Score) -> tuple[Model, float]:
+    """The model with a screened hypothesis, what is fitted already as it is or after the step that goes with it: whichever costs less; and its cost.
 
     Where drives have taken the place of a cause, as a stiffer gear takes that of one that yields late, the cause beside them
     as they are is far from the data.
@@ -272,7 +273,9 @@ def begin(problem: Problem, stage: Fit, score: Score) -> Model:
             return np.inf
         return found if np.isfinite(found) else np.inf
 
-    return min(models, key=cost) if len(models) > 1 else models[0]
+    costs = [cost(m) for m in models]
+    best = int(np.argmin(costs))
+    return models[best], costs[best]
 
 
 def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
@@ -312,7 +315,7 @@ def refit(
     """A candidate fitted from where screening put it.
 
     None where its model cannot be computed, costs more than ``most`` at the start, or ends where the data feel no change
-    of its last effect.
+    of its last effect, if it has any.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
@@ -326,6 +329,8 @@ def refit(
             )
     except NOT_COMPUTED:
         return None
+    if not result.model.effects:
+        return result
     felt = np.diag(result.information)[-len(result.model.effects[-1].p) :]
     return result if np.any(felt > 0.0) else None
 

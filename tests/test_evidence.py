@@ -31,7 +31,7 @@ from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import hinge_inertia
-from ident.inverse import REMAINDER_STEPS
+from ident.inverse import REMAINDER_STEPS, STALL_STEPS, stalled
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
 from ident.reporting import frf_views
@@ -339,7 +339,7 @@ def test_a_cause_begins_beside_the_drives_that_have_taken_its_place(identified, 
     moved = fit(problem, result.model)  # the drives take up what they can
     score, *_ = screen(problem, moved, predictions(problem, moved.model, moved.remainders), [h])
     costs = [
-        weighted_cost(problem, predictions(problem, begin(problem, moved, s), moved.remainders), moved.weights)
+        weighted_cost(problem, predictions(problem, begin(problem, moved, s)[0], moved.remainders), moved.weights)
         for s in (score, replace(score, step=None))
     ]
     assert costs[0] < 0.05 * costs[1]
@@ -706,6 +706,34 @@ def test_a_start_that_loses_the_data_is_not_followed(identified, named):
     assert followed(large) is None
     assert followed(none) is None
     assert refit(setup.problem, large, result.weights, result.remainders, 1) is not None
+    assert refit(setup.problem, replace(result.model, effects=()), result.weights, result.remainders, 1) is not None
+
+
+def test_a_start_far_off_the_data_is_not_fitted_but_for_the_best(identified, named, monkeypatch):
+    """A dead band far wider than the gear ever turns: it would be hit from end to end for minutes."""
+    _, setup, result = identified
+    rub, gear = named["coulomb_friction", "elbow_joint"], named["backlash", "wrist_1_joint"]
+    starts = {rub.key: np.array([1e-3, 0.0, 1e-3]), gear.key: np.array([0.1, 0.0])}
+    tried = []
+
+    def told(problem, model, *args, **kwargs):
+        tried.append(model.effects[-1].hypothesis.effect)
+        return refit(problem, model, *args, **kwargs)
+
+    monkeypatch.setattr("ident.search.refit", told)
+    for first, second, expected in ((rub, gear, {"coulomb_friction"}), (gear, rub, {"coulomb_friction", "backlash"})):
+        scores = [Score(h, g, 1, starts[h.key], np.ones(1), ()) for h, g in ((first, 2e3), (second, 1e3))]
+        monkeypatch.setattr("ident.search.screen", lambda *args, scores=scores: scores)
+        monkeypatch.setattr("ident.search.FIRST_STEPS", 1)
+        tried.clear()
+        explore(setup.problem, result, [first, second], 0.0, np.inf, Workers(), rough=True)
+        assert set(tried) == expected
+
+
+@pytest.mark.parametrize(("ratio", "expected"), [(0.5, False), (0.9, False), (0.99, True), (1.02, True)])
+def test_a_search_for_a_motion_that_does_not_repeat_is_given_up(ratio, expected):
+    changes = [ratio**i for i in range(4 * STALL_STEPS)]
+    assert stalled(changes) is expected and not stalled(changes[: 2 * STALL_STEPS - 1])
 
 
 def test_an_effect_that_the_data_need_stays_and_a_companion_that_they_do_not_goes(ur10, tmp_path):

@@ -5,14 +5,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from ident.attribute import LEFT_TO_DECOYS, Attribution, Round, attribute, temper_of, told_share, weighed_round
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
+from ident.conclude import drift_note
 from ident.diagnosis import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
 from ident.extended import Effect, along_record, as_loop
 from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
 from ident.hypotheses import catalogue
+from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
 from ident.search import hopeful, refit
 from ident.trust import denied
 from ident.verdict import UNKNOWN
@@ -112,6 +115,43 @@ def test_nothing_faint_is_sought_where_the_noise_is_not_measured(identified, hyp
     single = replace(group, U_periods=group.U_periods[:, :1], Q_periods=group.Q_periods[:, :1])
     for other in (single, replace(group, links=(1,))):
         assert faint_scores(replace(problem, groups=(other, *problem.groups[1:])), baseline, hypotheses, none) == []
+
+
+def test_lines_go_together_where_noise_drifts_and_nowhere_else():
+    """White, coloured, walking and drifting noise in records of 3 periods, cut without a window."""
+    rng, S, P, N, alpha = np.random.default_rng(4), 6, 3, 900, 0.8
+    white = rng.normal(size=(S, 2 * P * N))
+    coloured, walking = lfilter([1.0], [1.0, -alpha], white), np.cumsum(white, axis=1)
+    samples = np.stack([white, coloured, walking, np.cumsum(walking, axis=1)], axis=-1)[:, -P * N :]
+    lines = np.fft.rfft(samples.reshape(S, P, N, 4), axis=2)[:, :, 1:200]
+    together, count = line_coherence([lines[:3], lines[3:]])
+    assert np.sum(count) == S * (P - 1) * 198
+    assert np.all(together[:, :2] * np.sqrt(count)[:, None] < NO_CHANCE)
+    assert np.all(together[:-1, 2] > 0.15) and np.all(together[:-1, 2] < TOGETHER)
+    assert np.all(together[:-1, 3] > TOGETHER) and np.all((together[:, 3] * np.sqrt(count))[:-1] > NO_CHANCE)
+
+
+def test_nothing_faint_is_sought_beside_a_drift_and_the_verdict_tells_it(identified, hypotheses):
+    _, setup, baseline = identified
+    problem, j = setup.problem, 2
+    assert not np.any(drifting(problem.groups)) and drift_note(problem) == ()
+
+    def drifted(group, rng):
+        """With a torque that drifts at a joint beside the noise: a step where each period ends, in its lines."""
+        S, P, L, _ = group.U_periods.shape
+        saw = 1.0 / (1j * np.maximum(np.arange(L), 1))
+        step = 300.0 * np.sqrt(problem.tau_std[j] ** 2 / problem.samples(group)) * rng.normal(size=(S, P, 1))
+        U = group.U_periods.copy()
+        U[..., j] += step * saw
+        return replace(group, U_periods=U)
+
+    rng = np.random.default_rng(1)
+    problem = replace(problem, groups=tuple(drifted(g, rng) for g in problem.groups))
+    assert np.flatnonzero(drifting(problem.groups)).tolist() == [j]
+    asked = {s.hypothesis.joint for s in faint_scores(problem, baseline, hypotheses, np.zeros(6))}
+    assert asked and j not in asked and -1 not in asked
+    (note,) = drift_note(problem)
+    assert problem.structure.robot.joint_names[j] in note
 
 
 def test_a_law_along_the_record_hides_more_and_its_joint(identified, hypotheses):
