@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ident.convert.dates import seconds
 from ident.convert.mapping import LogMap, read_map
 from ident.convert.reading import read_log
 from ident.dataset import Dataset, Segment
@@ -92,12 +93,13 @@ def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str,
 
 def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
     if not m.files:
-        return read_log(paths[""], m.sources, m.time)
+        return read_log(paths[""], m.sources, {m.time} if m.time else frozenset())
     data = {}
     for part in m.files:
         start = f"{part.prefix}:"
         wanted = {s.removeprefix(start) for s in m.sources if s.startswith(start)}
-        for key, x in (read_log(paths[part.prefix], wanted) if wanted else {}).items():
+        times = {m.time.removeprefix(start)} if m.time and m.time.startswith(start) else frozenset()
+        for key, x in (read_log(paths[part.prefix], wanted, times) if wanted else {}).items():
             if part.width is not None:
                 if x.size % part.width:
                     raise DataError(key, str(paths[part.prefix]), f"{x.size} values", f"a multiple of width = {part.width}")
@@ -116,10 +118,10 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
     N = len(channels["q"])
     t = np.arange(N) / m.sample_rate
     if m.time is not None:
-        stamps = data[m.time].ravel() * m.time_factor
+        stamps = _stamps(data[m.time].ravel(), m.time_factor)
         if len(stamps) != N:
             raise DataError(m.time, str(path), f"{len(stamps)} time stamps", f"one for each of {N} samples")
-        channels, t = _resample(channels, stamps - stamps[0], m.sample_rate, path, say)
+        channels, t = _resample(channels, stamps, m.sample_rate, path, say)
         N = len(t)
     if m.period is None:
         return _motions(name, path, m, t, channels)
@@ -204,6 +206,11 @@ def _signal(x: np.ndarray, name: str, index: int, path: Path) -> np.ndarray:
     if index >= x.shape[1]:
         raise DataError(name, str(path), f"{x.shape[1]} columns", f"column {index} (index counts from 0)")
     return x[:, index]
+
+
+def _stamps(x: np.ndarray, factor: float) -> np.ndarray:
+    """(N,) s since the first; dates bring their own unit, others ``factor`` s of it."""
+    return seconds(x, x[0]) if x.dtype.kind in "Mm" else factor * x - factor * x[0]
 
 
 def _resample(
