@@ -62,6 +62,14 @@ def velocity(s: Segment, rate: float) -> np.ndarray:
     return np.concatenate([np.repeat(v[:1], half, axis=0), v, np.repeat(v[-1:], half, axis=0)])
 
 
+def filled_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Gaps of the log that its conversion has filled."""
+    if s.filled is None:
+        return []
+    f, share = s.filled, s.filled.total * dataset.sample_rate / len(s.t)
+    return [f"{f.gaps} gaps of the log, {f.longest:.3g} s the longest, {f.total:.3g} s in all ({share:.2g} of the segment), were filled by interpolation"]
+
+
 def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
     """Values that no such robot can have, and channels that contradict each other."""
     robot, out = dataset.robot, []

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import tomlkit
 
-from ident.convert.guess_names import CHANNELS, choose, families_of, score, words_of
+from ident.convert.guess_names import CHANNELS, choose, families_of, oriented, score, words_of
 from ident.convert.guess_units import NAMED_UNITS, Family, Scale, guess_scales, range_text, unwrapped
 from ident.convert.mapping import UNITS
 from ident.convert.reading import survey_log
-from ident.convert.spelling import unit_of
+from ident.convert.spelling import split_unit, unit_of
 from ident.convert.texts import VALUES
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, linear_joints, load_robot
@@ -58,17 +58,18 @@ def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
     surveys = [survey_log(p) for p in paths]
     logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in s.signals.items()} for s in surveys]
     parts = _parts(paths, logs, arm.n)
-    signals = _joined(paths, logs, parts) if parts else logs[0]
     starts = [f"{prefix}:" for prefix in parts] or [""]
     units = {f"{p}{k}": u for p, s in zip(starts, surveys) for k, text in s.units.items() if (u := unit_of(text.strip("[](){}<> ")))}
     dates = {f"{p}{k}" for p, s in zip(starts, surveys) for k in s.dates}
+    clocks = _clocks(logs, starts, units, dates, arm) if parts else {}
+    signals = _on_one_clock(logs, clocks) if clocks else _joined(logs, parts) if parts else logs[0]
     lengths = [_length(x) for x in signals.values() if _length(x) >= SHORTEST]
     if not lengths:
         raise DataError("log", str(paths[0]), f"no signal of {SHORTEST} samples or more", "columns of numbers")
     # The log has the length at which most values stand.
     N = max(set(lengths), key=lambda k: sum(x.size for x in signals.values() if _length(x) == k))
     families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm)
-    time, rate, time_unit = _time(families, signals, dates)
+    time, rate, time_unit = _time(families, signals, dates) if not clocks else (None, min(c.rate for c in clocks.values()), "")
     chosen, others = choose([f for f in families if f.x.shape[1] == arm.n and f is not time and f.name not in dates], arm)
     if not {"tau", "q"} & set(chosen):
         names = ", ".join(_plain(f.name) for f in families if f is not time)
@@ -76,10 +77,10 @@ def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
     linear = linear_joints(arm)
     chosen = {c: unwrapped(f) if c in ("q", "q_ref", "q_link") and not np.any(linear) else f for c, f in chosen.items()}
     scales = guess_scales(chosen, arm, linear, rate)
-    text = _render(paths, arm, parts, time, time_unit, rate, chosen, others, scales, families, linear)
+    text = _render(paths, arm, parts, clocks, time, time_unit, rate, chosen, others, scales, families, linear)
     found = {c: f"{chosen[c].name}{', ' + ', '.join(s.options) if (s := scales[c]).options else ''}" for c in chosen}
-    if time is not None:
-        found["time"] = f"{time.name}, {rate:g} Hz"
+    if time is not None or clocks:
+        found["time"] = f"{time.name if time is not None else ', '.join(c.name for c in clocks.values())}, {rate:g} Hz"
     return GuessedMap(text, found, tuple(c for c in ("tau", "q") if c not in chosen))
 
 
@@ -97,8 +98,9 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict
         if x is None or x.shape[1] > 1 or n == 1 or x.size % n:
             return {}
         return {paths[0].stem: (paths[0], n)}
-    scores = [score(words_of(name), channel) for name in logs[0] for channel in ("tau", "q")]
-    both = all(any(score(words_of(name), c) > 0 for name in logs[0]) for c in ("tau", "q"))
+    told = [split_unit(name) for name in logs[0]]
+    scores = [score(words_of(stem), channel, unit) for stem, unit in told for channel in ("tau", "q")]
+    both = all(any(score(words_of(stem), c, unit) > 0 for stem, unit in told) for c in ("tau", "q"))
     if scores and both:
         return {}
     shortest = min((_length(x) for log in logs for x in log.values() if _length(x) >= SHORTEST), default=0)
@@ -110,9 +112,43 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict
     return out
 
 
-def _joined(
-    paths: list[Path], logs: list[dict[str, np.ndarray]], parts: dict[str, tuple[Path, int | None]]
-) -> dict[str, np.ndarray]:
+@dataclass(frozen=True)
+class FileClock:
+    """The time column of one of several files: its name, rate in Hz, unit ("" of dates) and times in s."""
+
+    name: str
+    rate: float
+    unit: str
+    t: np.ndarray
+
+
+def _clocks(
+    logs: list[dict[str, np.ndarray]], starts: list[str], units: dict[str, str], dates: set[str], arm: Robot
+) -> dict[str, FileClock]:
+    """Prefix -> clock where each file has one of its own; else empty."""
+    out = {}
+    for log, start in zip(logs, starts, strict=True):
+        own = {k: units[f"{start}{k}"] for k in log if f"{start}{k}" in units}
+        time, rate, unit = _time(families_of(log, own, arm), log, {d.removeprefix(start) for d in dates if d.startswith(start)})
+        if time is None or rate is None:
+            return {}
+        out[start] = FileClock(time.sources[0][0], rate, unit, time.x[:, 0] * UNITS[unit or "s"])
+    return out
+
+
+def _on_one_clock(logs: list[dict[str, np.ndarray]], clocks: dict[str, FileClock]) -> dict[str, np.ndarray]:
+    """Signals of all files at the lowest of their rates, near enough for a guess: begun together."""
+    rate, end = min(c.rate for c in clocks.values()), min(c.t[-1] - c.t[0] for c in clocks.values())
+    t = np.arange(max(int(end * rate), SHORTEST)) / rate
+    out = {}
+    for log, (start, c) in zip(logs, clocks.items(), strict=True):
+        for name, x in log.items():
+            if name != c.name and _length(x) == len(c.t):
+                out[f"{start}{name}"] = np.stack([np.interp(t, c.t - c.t[0], column) for column in oriented(x).T], axis=1)
+    return out
+
+
+def _joined(logs: list[dict[str, np.ndarray]], parts: dict[str, tuple[Path, int | None]]) -> dict[str, np.ndarray]:
     out = {}
     for log, (prefix, (_, width)) in zip(logs, parts.items(), strict=True):
         for name, x in log.items():
@@ -171,6 +207,7 @@ def _render(
     paths: list[Path],
     arm: Robot,
     parts: dict[str, tuple[Path, int | None]],
+    clocks: dict[str, FileClock],
     time: Family | None,
     time_unit: str,
     rate: float | None,
@@ -192,7 +229,14 @@ def _render(
         lines += ["", "[roles]", *(f'{_quoted(p.name)} = "{"validation" if p is paths[-1] else "identification"}"' for p in paths)]
     if parts:
         lines += ["", "[files]                  # one log over several files; their signals are prefix:name"]
-        lines += [f"{_quoted(k)} = {{ name = {_quoted(p.name)}{f', width = {w}' if w else ''} }}" for k, (p, w) in parts.items()]
+        for prefix, (path, width) in parts.items():
+            options = [f"name = {_quoted(path.name)}", *([f"width = {width}"] if width else [])]
+            clock = clocks.get(f"{prefix}:")
+            if clock is not None:
+                options += [f"time = {_quoted(clock.name)}", *([f'unit = "{clock.unit}"'] if clock.unit else [])]
+            lines.append(f"{_quoted(prefix)} = {{ {', '.join(options)} }}")
+        if clocks:
+            lines.append("# Each has a time of its own: they are joined where all of them have samples.")
     if time is not None:
         lines += ["", "[time]", f"source = {_quoted(time.sources[0][0])}"]
         lines += [f'unit = "{time_unit}"'] if time_unit else ["# dates, which need no unit"]
