@@ -19,6 +19,7 @@ UNITS = {
     "m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
     "degC": 1.0,
 }  # fmt: skip
+SMALLEST = 1e-15  # a factor that leaves nothing of any signal
 COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
 OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap", "plus"}
 KEYS = {"sample_rate", "input_hold", "time", "files", "columns", "multisine", "roles", "split"}
@@ -235,6 +236,8 @@ def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
     ratio = number(entry, "gear", here, default=float(ratio))
     if ratio == 0 or factor == 0:
         raise DataError(key, where, "a factor of zero", "gear, sign, scale and torque_constant other than zero")
+    if abs(factor) < SMALLEST or abs(ratio) < SMALLEST:
+        raise DataError(key, where, f"a factor of {min(abs(factor), abs(ratio)):.3g}", f"unit, sign, scale, torque_constant and gear of at least {SMALLEST:g} in all")
     # Torques grow by the gear ratio on the way to the link, angles shrink; a temperature has no side.
     factor *= ratio if channel in ("tau", "r") else 1.0 if channel == "temp" else 1.0 / ratio
     unwrap = entry.get("unwrap", False)

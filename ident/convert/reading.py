@@ -17,6 +17,7 @@ from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
 DEEPEST = 8  # structures inside structures that are looked into
+MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
 MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
 Signals = dict[str, np.ndarray]
 
@@ -182,15 +183,30 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
     import h5py
 
     found: dict[str, Any] = {}
+    groups, items = set(), 0
 
-    def visit(name: str, item: Any) -> None:
-        dotted = name.replace("/", ".")
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
-            text = item.attrs.get("MATLAB_class", b"") == b"char"
-            if not text and not item.attrs.get("MATLAB_empty", 0) and (wanted is None or dotted in wanted):
-                found[dotted] = item
+    def walk(group: Any, start: str, depth: int) -> None:
+        nonlocal items
+        address = h5py.h5o.get_info(group.id).addr
+        if depth > DEEPEST or address in groups:  # a group may hold itself
+            return
+        groups.add(address)
+        for name in group:
+            items += 1
+            if items > MOST_ITEMS:
+                raise DataError("log", str(path), f"more than {MOST_ITEMS} groups and arrays", "a recording")
+            # Where MATLAB keeps what cells hold; and links, which may lead out of the file.
+            if (name.startswith("#") and not start) or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue
+            item, dotted = group[name], f"{start}{name}"
+            if isinstance(item, h5py.Group):
+                walk(item, f"{dotted}.", depth + 1)
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and (wanted is None or dotted in wanted):
+                text = item.attrs.get("MATLAB_class", b"") == b"char"
+                if not text and not item.attrs.get("MATLAB_empty", 0):
+                    found[dotted] = item
 
-    file.visititems(visit)
+    walk(file, "", 0)
     for name, item in found.items():
         if item.external or item.is_virtual:
             raise DataError("signal", str(path), f"{name}, which stands in another file", "one in the file itself")
