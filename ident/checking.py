@@ -13,12 +13,12 @@ from ident.channel_checks import (
     excitation_warnings,
     filled_warnings,
     lost_sample_warnings,
-    skew_warnings,
     stuck_warnings,
     unit_warnings,
 )
 from ident.dataset import CHANNELS, Dataset, Segment
 from ident.records import difference_noise
+from ident.skew_checks import skew_warnings
 from ident.torque_checks import torque_warnings
 from robot_assets.robot import linear_joints
 

@@ -6,6 +6,7 @@ import codecs
 import csv
 import re
 import warnings
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,11 @@ class Layout:
 
 
 def read_layout(path: Path) -> Layout:
-    """Look at the first lines of a text."""
+    """Look at the first lines of a text.
+
+    Raises:
+        DataError: where a line is too long for a table.
+    """
     encoding = _encoding(path)
     comments: list[str] = []
     with path.open(encoding=encoding, errors="replace", newline=None) as file:
@@ -56,6 +61,8 @@ def read_layout(path: Path) -> Layout:
             line = file.readline(LONGEST_LINE)
         rows = [line, *(file.readline(LONGEST_LINE) for _ in range(LOOKED_AT))]
     rows = [r for r in rows if r]
+    if any(len(r) >= LONGEST_LINE for r in (*comments, *rows)):
+        raise DataError("log", str(path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
     first = rows[0] if rows else ""
     delimiter = _delimiter(first, rows[1] if len(rows) > 1 else first)
     words = _words(first, delimiter)
@@ -103,7 +110,7 @@ def text_units(path: Path) -> dict[str, str]:
 
 def distinct(names: list[str], wanted: set[str] | None, path: Path) -> None:
     """Raise a DataError where a signal that is wanted stands in two columns."""
-    double = sorted({n for n in names if names.count(n) > 1 and (wanted is None or n in wanted)}) if len(set(names)) < len(names) else []
+    double = sorted(n for n, times in Counter(names).items() if times > 1 and (wanted is None or n in wanted))
     if double:
         raise DataError("signal", str(path), f"{double[0]} twice", "each signal once")
 
