@@ -1,4 +1,4 @@
-"""What looks wrong in the channels of one recording: units, clipping, freezes, lost samples, skew, poor motion.
+"""What looks wrong in the channels of one recording: units, clipping, freezes, lost samples, poor motion.
 
 Each check is a function of one segment that gives sentences; none changes data. Thresholds are wide:
 a warning is worth reading, silence proves nothing.
@@ -6,14 +6,12 @@ a warning is worth reading, silence proves nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pinocchio as pin
 import scipy.signal
 
 from ident.dataset import Dataset, Segment
-from ident.graybox import Structure, build_structure
+from ident.graybox import build_structure
 from ident.records import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
@@ -21,36 +19,8 @@ from robot_assets.urdf import read_urdf
 FREEZE = 0.1  # s: a channel that stands still for longer while the joint moves
 CLIPPED = 3e-3  # share of the samples at the very largest value, in runs of three or more
 SMOOTH = 1e-5  # torque noise over torque rms, below which a log was filtered
-LATEST = 0.03  # s: skews are looked for up to here
-ODD = 1.0  # samples: skews of less are common
-HELD = 0.5  # samples by which a torque that is held over a sample is recorded early
-SETTLED = 0.3  # s: the filter of the band has forgotten the ends of the log
-BAND = 12.0  # Hz: band in which skew is estimated; rigid bodies and friction explain torque there
-BLOCKS = 8  # stretches of time, of which the jackknife leaves one out
-LONGEST = 2000  # instants that an estimate of skew looks at
-RANK = 1e-6  # of the largest singular value, below which columns tell the same
-EXPLAINED = 0.9  # share of the torque that must be explained for its skew to mean anything
-GONE = 0.3  # share of what is unexplained without a skew that must go with it
-SURE = 8.0  # deviations of a skew, of eight stretches of time: one in ten thousand by chance (Student's t)
-ONE_JOINT = 0.5  # share of a skew that may go with one joint
 MOVES = 3.0  # standard deviation of a position over its noise
 LOW_SHARE = 0.1  # of the sample rate
-MOVING = 0.1  # of the largest speed: slower samples are left out, where friction is of another kind
-
-
-@dataclass(frozen=True)
-class Skew:
-    """How late one channel comes after another, s, with its standard deviation; NaN where it cannot be told."""
-
-    late: float
-    std: float
-
-    @property
-    def sure(self) -> bool:
-        return bool(np.isfinite(self.late) and abs(self.late) > SURE * self.std)
-
-
-UNKNOWN = Skew(np.nan, np.nan)
 
 
 def velocity(s: Segment, rate: float) -> np.ndarray:
@@ -60,6 +30,14 @@ def velocity(s: Segment, rate: float) -> np.ndarray:
         return np.zeros_like(s.q)
     v = (s.q[2 * half :] - s.q[: -2 * half]) * rate / (2 * half)
     return np.concatenate([np.repeat(v[:1], half, axis=0), v, np.repeat(v[-1:], half, axis=0)])
+
+
+def filled_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Gaps of the log that its conversion has filled."""
+    if s.filled is None:
+        return []
+    f, share = s.filled, s.filled.total * dataset.sample_rate / len(s.t)
+    return [f"{f.gaps} gaps of the log, {f.longest:.3g} s the longest, {f.total:.3g} s in all ({share:.2g} of the segment), were filled by interpolation"]
 
 
 def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
@@ -187,146 +165,6 @@ def _resolution(step: np.ndarray) -> float:
     counts = size / size.min()
     whole = np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95
     return float(size.min()) if whole else 0.0
-
-
-def torque_skew(s: Segment, dataset: Dataset) -> Skew:
-    """How late the torques come after the positions, s: the shift at which rigid bodies explain them best.
-
-    All joints together, as one channel of torques is sampled at one time: torque is a linear combination
-    of the rigid-body regressor, of motor inertia and of friction. Samples of slow joints, where friction
-    has memory, are left out. The deviation is that of a jackknife over ``BLOCKS`` stretches of time. A shift that
-    leaves most of what was unexplained stands for something else, such as a gear with lost motion, and one
-    that is gone without one of the joints is no skew of the channels, but an effect of that joint.
-    It is a cross-correlation in which inertia, gravity and friction have their place.
-    """
-    rate, n = dataset.sample_rate, dataset.n
-    q, tau, v, a = _band(s, rate)
-    every = max(1, int(rate / (5 * BAND)), len(q) // LONGEST)
-    edge = int(rate * SETTLED) + 1
-    pick = np.arange(edge, len(q) - edge, every)
-    if len(pick) < 40 * BLOCKS // 2 or not np.any(np.ptp(v, axis=0) > 0):
-        return UNKNOWN
-    structure = build_structure(dataset.robot)
-    # Friction turns over within a sample, the torque in its band does not: both pass the same filter.
-    turns = _low(np.sign(v), rate)
-    B = _torque_columns(structure, q[pick], v[pick], a[pick], turns[pick])
-    scale = np.maximum(tau.std(axis=0), 1e-300)
-    keep = np.abs(v[pick]) > MOVING * np.maximum(np.abs(v).max(axis=0), 1e-300)
-    size = np.linalg.norm(B.reshape(-1, B.shape[2]), axis=0)
-    B = B[:, :, size > 1e-9 * size.max()] / size[size > 1e-9 * size.max()] / scale[:, None]
-    rows = keep.ravel()
-    block = np.repeat(np.arange(len(pick)) * BLOCKS // len(pick), n)[rows]
-    A = B.reshape(-1, B.shape[2])
-    late, time = 0.0, np.arange(len(tau)) / rate
-    unexplained = []
-    for _ in range(8):
-        y = np.stack([np.interp(time[pick] + late, time, x) for x in tau.T], axis=1) / scale
-        x = np.linalg.lstsq(A[rows], y.ravel()[rows], rcond=RANK)[0]
-        fit = (A @ x).reshape(y.shape)
-        unexplained.append(float(np.sum((y - fit).ravel()[rows] ** 2)))
-        slope = np.gradient(fit, every / rate, axis=0).ravel()[rows]
-        step = _shift(A[rows], slope, y.ravel()[rows])
-        late = late - step
-        if abs(late) > LATEST:
-            return UNKNOWN
-        if abs(step) < 1e-6:
-            break
-    if unexplained[-1] > (1.0 - EXPLAINED) * np.sum((y - y.mean(axis=0)).ravel()[rows] ** 2):
-        return UNKNOWN
-    parts = np.array([_shift(A[rows][block != k], slope[block != k], y.ravel()[rows][block != k]) for k in range(BLOCKS)])
-    skew = Skew(float(late), float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2))))
-    if skew.sure and unexplained[-1] > (1.0 - GONE) * unexplained[0]:
-        return UNKNOWN
-    at = np.tile(np.arange(n), len(pick))[rows]
-    for j in range(n) if skew.sure and n > 1 else ():
-        others = at != j
-        without = late - _shift(A[rows][others], slope[others], y.ravel()[rows][others]) if others.sum() > A.shape[1] else late
-        if not abs(without - late) < ONE_JOINT * abs(late):
-            return UNKNOWN
-    return skew
-
-
-def _torque_columns(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """(N, n, columns) what joint torques are a linear combination of; ``turns``: direction of motion."""
-    model, data, d = structure.model, structure.model.createData(), structure.driven
-    N, n = q.shape
-    full = np.zeros((3, N, model.nv))
-    for k, x in enumerate((q, v, a)):
-        full[k][:, d] = x
-    rigid = np.array([pin.computeJointTorqueRegressor(model, data, *full[:, i]).reshape(model.nv, -1)[d].copy() for i in range(N)])
-    own = np.zeros((N, n, 5 * n))
-    for j in range(n):
-        own[:, j, 5 * j : 5 * j + 5] = np.stack([a[:, j], v[:, j], v[:, j] * np.abs(v[:, j]), turns[:, j], np.ones(N)], axis=1)
-    return np.concatenate([rigid, own], axis=2)
-
-
-def _shift(A: np.ndarray, slope: np.ndarray, y: np.ndarray) -> float:
-    """Least-squares coefficient of ``slope`` beside the columns ``A``."""
-    if not A.size:
-        return 0.0
-    U, sv, _ = np.linalg.svd(A, full_matrices=False)
-    U = U[:, sv > RANK * sv[0]]
-    own = slope - U @ (U.T @ slope)
-    return float(own @ (y - U @ (U.T @ y)) / max(own @ own, 1e-300))
-
-
-def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
-    """How late the link encoder of each joint comes after its motor encoder, s.
-
-    ``q - q_link = late q' + (M q'' + c + g) / stiffness + lost motion sign(q') + offset``: the gear carries
-    the link, as the URDF has it, and not the friction of the motor.
-    """
-    out, rate = [], dataset.sample_rate
-    if s.q_link is None:
-        return [UNKNOWN] * dataset.n
-    q, _, v, a = _band(s, rate)
-    structure, edge = build_structure(dataset.robot), int(rate * SETTLED)
-    data, full = structure.model.createData(), np.zeros((3, len(q), structure.model.nv))
-    for k, x in enumerate((q, v, a)):
-        full[k][:, structure.driven] = x
-    carried = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(q))])[:, structure.driven]
-    for j in range(dataset.n):
-        link = None if s.q_link is None else s.q_link[:, j]
-        keep = np.abs(v[:, j]) > MOVING * np.abs(v[:, j]).max()
-        keep[:edge] = keep[len(keep) - edge :] = False
-        if link is None or not np.all(np.isfinite(link)) or np.ptp(link) == 0 or keep.sum() < 10 * BLOCKS:
-            out.append(UNKNOWN)
-            continue
-        y = _low(s.q[:, [j]] - link[:, None], rate)[keep, 0]
-        A = np.stack([carried[:, j], a[:, j], np.sign(v[:, j]), np.ones(len(q))], axis=1)[keep]
-        A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-        slope = v[keep, j]
-        block = np.arange(len(y)) * BLOCKS // len(y)
-        parts = np.array([_shift(A[block != k], slope[block != k], y[block != k]) for k in range(BLOCKS)])
-        out.append(Skew(_shift(A, slope, y), float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2)))))
-    return out
-
-
-def _low(x: np.ndarray, rate: float) -> np.ndarray:
-    cut = min(BAND, 0.2 * rate)
-    return scipy.signal.sosfiltfilt(scipy.signal.butter(3, cut / (rate / 2), output="sos"), x, axis=0)
-
-
-def _band(s: Segment, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Position, torque, velocity and acceleration in the low band, (N, n) each."""
-    q, tau = _low(s.q, rate), _low(s.tau, rate)
-    v = np.gradient(q, 1 / rate, axis=0)
-    return q, tau, v, np.gradient(v, 1 / rate, axis=0)
-
-
-def skew_warnings(s: Segment, dataset: Dataset) -> list[str]:
-    """Skews that are sure; of motions only, where rigid bodies rule."""
-    rate = dataset.sample_rate
-    held = HELD / rate if dataset.input_hold == "zoh" else 0.0
-    if s.kind != "trajectory" or len(s.t) < 4 * rate * SETTLED + 100:
-        return []
-    named = [("torque", "the positions", torque_skew(s, dataset), -held)]
-    named += [(f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k, 0.0) for j, k in enumerate(link_skew(s, dataset))]
-    return [
-        f"{what} comes {abs(k.late) * 1e3:.2g} ms {'after' if k.late > 0 else 'before'} {other} (± {k.std * 1e3:.1g} ms): channels sampled at different times?"
-        for what, other, k, usual in named
-        if k.sure and abs(k.late - usual) > ODD / rate
-    ]
 
 
 def excitation_warnings(s: Segment, dataset: Dataset) -> list[str]:

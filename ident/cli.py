@@ -354,10 +354,11 @@ def convert(
         return _guess(files, robot, map_, json_)
     if out is None:
         raise DataError("--out", "command line", "no such option", "where to write the dataset, or --guess")
-    with _progress(quiet or json_) as (say, _):
-        data = convert_logs(files, robot, map_, name=out.name, say=say)
+    notes: list[str] = []
+    data = convert_logs(files, robot, map_, name=out.name, say=notes.append)
     save_dataset(data, out)
-    _print({"dataset": str(out), "segments": len(data.segments)}, json_, f"{len(data.segments)} segments in {out}")
+    text = "\n".join([f"{len(data.segments)} segments in {out}", *(f"  {note}" for note in notes)])
+    _print({"dataset": str(out), "segments": len(data.segments), "changed": notes}, json_, text)
 
 
 def _guess(files: list[Path], robot: str, out: Path, json_: bool) -> None:

@@ -12,6 +12,16 @@ from robot_assets.robot import Robot
 
 CHANNELS = ("tau", "q", "qd", "r", "q_ref", "q_link", "temp")
 
+
+@dataclass(frozen=True)
+class Filled:
+    """Gaps of a log that were filled by interpolation: how many, the longest and all of them, s."""
+
+    gaps: int
+    longest: float
+    total: float
+
+
 @dataclass(frozen=True)
 class Segment:
     """One recording. Times in s, torques in N m, positions in rad, link side of the gear.
@@ -27,6 +37,7 @@ class Segment:
         experiment: column of the orthogonal excitation, from 1. realization: from 1.
         amplitude: relative excitation level.
         excited_lines: (F,) DFT lines.
+        filled: what was made up of the log; None where nothing was.
     """
 
     name: str
@@ -49,6 +60,7 @@ class Segment:
     realization: int | None = None
     amplitude: float = 1.0
     excited_lines: np.ndarray = field(default_factory=lambda: np.empty(0, int))
+    filled: Filled | None = None
 
     @property
     def n_samples(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomlkit
 
-from ident.dataset import CHANNELS, Dataset, Segment
+from ident.dataset import CHANNELS, Dataset, Filled, Segment
 from ident.outputs import take_place
 from ident.segment_file import read_segment
 from robot_assets.errors import DataError
@@ -158,6 +158,8 @@ def _head(dataset: Dataset, target: Path) -> dict[str, Any]:
             entry |= {k: getattr(s, k) for k in ("experiment", "realization") if getattr(s, k) is not None}
             entry["amplitude"] = float(s.amplitude)
             entry["excited_lines"] = [int(k) for k in s.excited_lines]
+        if s.filled is not None:
+            entry["filled"] = asdict(s.filled)
         entries.append(entry)
     head["segment"] = entries
     return head
@@ -201,6 +203,7 @@ def _segment(entry: dict, i: int, folder: Path, toml: str, n: int, rate: float, 
         q0=None if "q0" not in entry else vector(entry["q0"], "q0", where, n, f"{n} finite numbers, one per joint"),
         operating_point=None if "operating_point" not in entry else text(entry, "operating_point", where),
         amplitude=number(entry, "amplitude", where, low=1e-9, high=1e9, default=1.0),
+        filled=_filled(entry, where),
         **channels,
     )
     if kind == "trajectory":
@@ -222,6 +225,15 @@ def _segment(entry: dict, i: int, folder: Path, toml: str, n: int, rate: float, 
         realization=whole(entry, "realization", where, low=1, default=None),
         excited_lines=_lines(entry.get("excited_lines", []), period, where),
     )
+
+
+def _filled(entry: dict, where: str) -> Filled | None:
+    if "filled" not in entry:
+        return None
+    filled = subtable(entry, "filled", where)
+    here = f"{where} filled"
+    gaps = whole(filled, "gaps", here, low=1)
+    return Filled(gaps, number(filled, "longest", here, low=0.0), number(filled, "total", here, low=0.0))
 
 
 def _inside(folder: Path, file: str, where: str) -> Path:

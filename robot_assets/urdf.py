@@ -15,6 +15,8 @@ from robot_assets.values import LARGEST
 MOVABLE = ("revolute", "continuous", "prismatic")
 MOST = 1000  # links, and joints
 NEGATIVE = 1e-3  # of the largest moment of inertia: what rounding in a file may leave below zero
+EXCESS = 0.02  # of the largest moment, by which it may exceed the other two together: rounding in a file
+SLIGHT = 1e-5  # kg m2, the same: placeholders of links that weigh nothing
 DEEPEST = 100  # elements inside elements: parsers of the engines recurse
 
 
@@ -73,6 +75,7 @@ def read_urdf(path: Path) -> Description:
         elif joint.get("type") != "fixed":
             raise DataError(f"joint {name} type", str(path), repr(joint.get("type")), f"fixed or one of {MOVABLE}")
     _one_tree(links, parent, path)
+    _check_mimics(joints, path)
     for element, link in zip(root.findall("link"), links, strict=True):
         _check_inertial(element.find("inertial"), link, path)
     return Description(frozenset(links), limits, child, kinds, axes)
@@ -126,6 +129,20 @@ def _one_tree(links: list[str], parent: dict[str, str], path: Path) -> None:
             raise DataError(f"link {link}", str(path), "a loop of joints", "a tree of links")
 
 
+def _check_mimics(joints: list[tuple[str, ET.Element]], path: Path) -> None:
+    """Raise a DataError where a joint mimics none of the URDF, or in the end itself."""
+    leads = {name: str(mimic.get("joint")) for name, e in joints if (mimic := e.find("mimic")) is not None}
+    names = {name for name, _ in joints}
+    for name in leads:
+        at, steps = name, 0
+        while at in leads and steps <= len(leads):
+            at, steps = leads[at], steps + 1
+            if at == name:
+                raise DataError(f"mimic of joint {name}", str(path), "itself" if steps == 1 else "a loop of joints", "another joint")
+        if leads[name] not in names:
+            raise DataError(f"mimic of joint {name}", str(path), repr(leads[name]), "a joint of the URDF")
+
+
 def _limit(joint: ET.Element, name: str, path: Path) -> tuple[float, float]:
     limit = joint.find("limit")
     if limit is None or joint.get("type") == "continuous":
@@ -152,6 +169,10 @@ def _check_inertial(inertial: ET.Element | None, link: str, path: Path) -> None:
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if moments.min() < -NEGATIVE * np.abs(moments).max():
         raise DataError(f"inertia of link {link}", str(path), f"a moment of {moments.min():.3g} kg m2", "moments of at least zero")
+    a, b, c = moments
+    if c - a - b > max(EXCESS * c, SLIGHT):
+        found = f"moments of {a:.3g}, {b:.3g} and {c:.3g} kg m2"
+        raise DataError(f"inertia of link {link}", str(path), found, "none larger than the other two together, as of any body")
 
 
 def _numbers(origin: ET.Element | None, what: str, path: Path) -> None:

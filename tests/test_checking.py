@@ -8,9 +8,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from ident.channel_checks import link_skew, lost_sample_warnings, torque_skew
+from ident.channel_checks import lost_sample_warnings
 from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
+from ident.skew_checks import link_skew, skew_warnings, torque_skew
 from robot_assets.robot import load_robot
 
 RATE, N = 500.0, 6000
@@ -170,6 +171,28 @@ def test_skews_are_estimated_within_their_deviation(name, late):
     assert abs(found.late - late) < 4 * found.std + 1e-4 and found.std < 2e-3, found
     for k in link_skew(s, dataset(robot, s)):
         assert abs(k.late - late) < 4 * k.std + 2e-4 and k.std < 1e-3, k
+
+
+@pytest.mark.parametrize("name", ["ur10_bare", "panda_bare", "emps"])
+def test_skews_of_less_than_a_sample_are_said_where_they_are_sure(name):
+    robot, rate, found = load_robot(name), 250.0, {0.0: [], 0.6: [], -0.5: []}
+    for seed in range(3):
+        for late, said in found.items():
+            s = recording(robot, np.random.default_rng(seed), late=late / rate, q_link_late=max(late, 0.0) / rate, N=3000, rate=rate)
+            said += skew_warnings(s, replace(dataset(robot, s), sample_rate=rate))
+    assert found[0.0] == []
+    after = [w for w in found[0.6] if w.startswith("torque")]
+    assert len(after) == 3 and all(abs(float(w.split()[2]) - 2.4) < 0.3 and "ms after the positions" in w for w in after)
+    assert sum(w.startswith("q_link_1") and "2.4 ms after q_1" in w for w in found[0.6]) == 3
+    held = [w for w in found[-0.5] if w.startswith("torque")]
+    assert len(held) == 3 and all("before the positions" in w and 'input_hold = "zoh"' in w for w in held)
+
+
+def test_a_torque_that_is_held_over_a_sample_is_early_by_half_of_it_and_that_is_usual():
+    robot, rate = load_robot("emps"), 250.0
+    s = recording(robot, np.random.default_rng(0), late=-0.5 / rate, N=3000, rate=rate)
+    data = replace(dataset(robot, s), sample_rate=rate)
+    assert len(skew_warnings(s, data)) == 1 and skew_warnings(s, replace(data, input_hold="zoh")) == []
 
 
 def test_a_multisine_experiment_gives_no_warning(clean):

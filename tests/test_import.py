@@ -16,7 +16,8 @@ import scipy.signal
 
 from ident.convert import convert_logs
 from ident.convert.bags import JOINT_STATE
-from ident.convert.guess import _words, guess_map
+from ident.convert.guess import guess_map
+from ident.convert.guess_names import words_of
 from ident.dataset_io import load_dataset, save_dataset
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import draft_robot, write_robot
@@ -637,4 +638,4 @@ def test_both_engines_build_the_robots_of_the_real_data(name):
     ],
 )
 def test_words_of_a_column_are_taken_apart(name, words):
-    assert _words(name) == words
+    assert words_of(name) == words

@@ -1,5 +1,8 @@
 """Logs as users have them: gaps, wrapped angles, other encodings, torques of another run."""
 
+import time
+
+import h5py
 import numpy as np
 import pytest
 
@@ -11,6 +14,7 @@ from ident.gain import Errors, measure_gain
 from ident.torque_checks import mislabelled
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
+from robot_assets.urdf import read_urdf
 from tests.test_cli import simgap as run
 
 RATE = 200.0
@@ -136,3 +140,93 @@ def test_outputs_that_cannot_be_made_are_one_line(tmp_path):
             result = run(*command, out)
             (line,) = result.stderr.strip().splitlines()
             assert result.returncode == 2 and at_fault in line and str(out) in line
+
+
+BODY = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="{mass}"/>
+  <inertia ixx="{i[0]}" iyy="{i[1]}" izz="{i[2]}" ixy="{i[3]}" ixz="0" iyz="0"/></inertial></link>
+  <joint name="one" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" effort="80" velocity="3"/>{mimic}</joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("mass", "moments", "mimic", "found"),
+    [
+        (3, (0.1, 0.1, 0.1, 0), "", None),
+        (3, (0.1, 0.1, 0.201, 0), "", None),  # a plate, rounded
+        (0, (0, 0, 0, 0), "", None),
+        (1e-6, (1e-6, 1e-6, 1e-6, 1e-6), "", None),  # a placeholder
+        (-3, (0.1, 0.1, 0.1, 0), "", "mass of link b"),
+        (3, (0.1, 0.1, -0.1, 0), "", "a moment of -0.1 kg m2"),
+        (3, (0.1, 0.1, 0.1, 0.2), "", "a moment of -0.1 kg m2"),
+        (3, (0.1, 0.1, 0.3, 0), "", "moments of 0.1, 0.1 and 0.3 kg m2"),
+        (3, (0.1, 0.1, 0.1, 0.04), "", None),
+        (3, (0.1, 0.1, 0.1, 0), '<mimic joint="one"/>', "found itself"),
+        (3, (0.1, 0.1, 0.1, 0), '<mimic joint="two"/>', "a joint of the URDF"),
+    ],
+)
+def test_bodies_and_mimics_that_cannot_be_are_one_line(tmp_path, mass, moments, mimic, found):
+    (tmp_path / "r.urdf").write_text(BODY.format(mass=mass, i=moments, mimic=mimic))
+    if found is None:
+        read_urdf(tmp_path / "r.urdf")
+    else:
+        with pytest.raises(DataError, match=found):
+            read_urdf(tmp_path / "r.urdf")
+
+
+def test_joints_that_mimic_each_other_are_refused(tmp_path):
+    text = BODY.format(mass=1, i=(1, 1, 1, 0), mimic='<mimic joint="two"/>').replace("</robot>", "")
+    second = '<link name="c"/><joint name="two" type="revolute"><parent link="b"/><child link="c"/><mimic joint="{}"/></joint></robot>'
+    for lead in ("one", "two"):
+        (tmp_path / "r.urdf").write_text(text + second.format(lead))
+        with pytest.raises(DataError, match="mimic of joint"):
+            read_urdf(tmp_path / "r.urdf")
+    (tmp_path / "r.urdf").write_text((text + second.format("one")).replace('<mimic joint="two"/>', ""))
+    read_urdf(tmp_path / "r.urdf")
+
+
+def test_truth_values_are_no_positions(tmp_path):
+    _t, q = motion()
+    text = f'sample_rate = {RATE}\n[columns]\ntau_1 = "tau"\nq_1 = "q"\n'
+    (tmp_path / "map.toml").write_text(text)
+    np.savez(tmp_path / "log.npz", tau=q, q=q > 0)
+    (tmp_path / "log.csv").write_text("tau,q\n" + "\n".join(f"{x:.4f},{str(x > 0).lower()}" for x in q) + "\n")
+    for name in ("log.npz", "log.csv"):
+        assert list(list_signals(tmp_path / name)) == ["tau"]
+        with pytest.raises(DataError, match="q is no array of numbers but of true and false"):
+            convert_logs([tmp_path / name], "twomass", tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize(("option", "refused"), [("scale = 1e-320", True), ("gear = 1e-300", True), ("scale = 1e-6", False)])
+def test_factors_that_leave_nothing_of_a_signal_are_refused(tmp_path, option, refused):
+    log, given = written(tmp_path, {"tau": motion()[1], "q": motion()[1]}, f'[columns]\ntau_1 = "tau"\nq_1 = {{ source = "q", {option} }}\n')
+    if refused:
+        with pytest.raises(DataError, match="q_1"):
+            convert_logs([log], "twomass", given)
+    else:
+        convert_logs([log], "twomass", given)
+
+
+@pytest.mark.parametrize("shape", ["arrays", "groups", "inside each other"])
+def test_files_of_thousands_of_groups_end_soon(tmp_path, shape):
+    with h5py.File(tmp_path / "log.mat", "w") as file:
+        group = file
+        for k in range(400 if shape == "inside each other" else 6000):
+            if shape == "arrays":
+                file[f"d{k}"] = float(k)
+            else:
+                group = (group if shape == "inside each other" else file).create_group(f"g{k}")
+    began = time.process_time()
+    if shape == "inside each other":
+        assert list_signals(tmp_path / "log.mat") == {}
+    else:
+        with pytest.raises(DataError, match="more than 2000 groups and arrays"):
+            list_signals(tmp_path / "log.mat")
+    assert time.process_time() - began < 2.0
+
+
+def test_what_cells_of_matlab_hold_is_not_looked_at_one_by_one(tmp_path):
+    with h5py.File(tmp_path / "log.mat", "w") as file:
+        file["log/q"] = np.zeros((6, 100))
+        for k in range(2500):
+            file[f"#refs#/{k}"] = 0.0
+    assert list(list_signals(tmp_path / "log.mat")) == ["log.q"]

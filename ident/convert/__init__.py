@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
 
+from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
+from ident.convert.joining import on_one_clock
 from ident.convert.mapping import LogMap, read_map
 from ident.convert.reading import read_log
-from ident.dataset import Dataset, Segment
+from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
 from ident.segment_file import LARGEST, SHORTEST
 from robot_assets.errors import DataError
 from robot_assets.robot import ASSETS, load_robot
-
-JITTER = 0.05  # of a sample, above which time stamps are resampled
-LONGEST_GAP = 0.5  # s without a sample, at most: what happened in it cannot be made up
-LONGEST = 100  # times as many samples as the log: beyond, the unit of time is wrong
 
 
 def convert_logs(
@@ -92,13 +91,14 @@ def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str,
 
 def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
     if not m.files:
-        return read_log(paths[""], m.sources, m.time)
+        return read_log(paths[""], m.sources, {m.time} if m.time else frozenset())
     data = {}
     for part in m.files:
         start = f"{part.prefix}:"
         wanted = {s.removeprefix(start) for s in m.sources if s.startswith(start)}
-        for key, x in (read_log(paths[part.prefix], wanted) if wanted else {}).items():
-            if part.width is not None:
+        times = {part.time or (m.time or "").removeprefix(start)}
+        for key, x in (read_log(paths[part.prefix], wanted, times) if wanted else {}).items():
+            if part.width is not None and key != part.time:
                 if x.size % part.width:
                     raise DataError(key, str(paths[part.prefix]), f"{x.size} values", f"a multiple of width = {part.width}")
                 x = x.reshape(-1, part.width)
@@ -112,15 +112,34 @@ def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
 def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callable[[str], None]) -> list[Segment]:
     path = next(iter(paths.values()))
     data = _read(paths, m)
+    clocks: list[Stamps] = []
+    start = 0.0
+    if any(f.time is not None for f in m.files):
+        data, clocks, start = on_one_clock(data, m, paths, say)
     channels = _channels(data, m, n, path)
     N = len(channels["q"])
     t = np.arange(N) / m.sample_rate
     if m.time is not None:
-        stamps = data[m.time].ravel() * m.time_factor
-        if len(stamps) != N:
-            raise DataError(m.time, str(path), f"{len(stamps)} time stamps", f"one for each of {N} samples")
-        channels, t = _resample(channels, stamps - stamps[0], m.sample_rate, path, say)
-        N = len(t)
+        x = data[m.time].ravel()
+        if len(x) != N:
+            raise DataError(m.time, str(path), f"{len(x)} time stamps", f"one for each of {N} samples")
+        clock = check_stamps(stamp_seconds(x, m.time_factor, x[0]), m.sample_rate, path)
+        clocks, t = [clock], uniform_times(0.0, float(clock.t[-1]), m.sample_rate)
+        if not at_times(clock, t, m.sample_rate):
+            rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)
+            say(f"{path.name}: {changed(clock, rows, len(t), m.sample_rate)}")
+            channels = {k: resample(v, clock, t, m.sample_rate) for k, v in channels.items()}
+    return [replace(s, filled=_filled(clocks, start + s.t[0], start + s.t[-1])) for s in _cut(name, path, m, t, channels, data)]
+
+
+def _filled(clocks: list[Stamps], start: float, end: float) -> Filled | None:
+    found = [f for clock in clocks if (f := clock.filled(start, end)) is not None]
+    return Filled(sum(f.gaps for f in found), max(f.longest for f in found), sum(f.total for f in found)) if found else None
+
+
+def _cut(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray], data: dict[str, np.ndarray]) -> list[Segment]:
+    """Segments of one log: parts of a multisine, or a motion."""
+    N = len(t)
     if m.period is None:
         return _motions(name, path, m, t, channels)
     lines = np.array(m.excited_lines, int)
@@ -204,32 +223,3 @@ def _signal(x: np.ndarray, name: str, index: int, path: Path) -> np.ndarray:
     if index >= x.shape[1]:
         raise DataError(name, str(path), f"{x.shape[1]} columns", f"column {index} (index counts from 0)")
     return x[:, index]
-
-
-def _resample(
-    channels: dict[str, np.ndarray], stamps: np.ndarray, rate: float, path: Path, say: Callable[[str], None]
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Signals on a uniform grid; untouched where the stamps are uniform already."""
-    step = np.diff(stamps)
-    if not np.all(np.isfinite(stamps)) or np.any(step < 0):
-        raise DataError("time", str(path), "stamps that are not finite or go back", "rising time stamps")
-    if stamps[-1] * rate > LONGEST * len(stamps) or stamps[-1] * rate < len(stamps) / LONGEST:
-        found = f"{len(stamps)} samples over {stamps[-1]:.4g} s"
-        raise DataError("time", str(path), found, f"about sample_rate = {rate:g} Hz: is the unit of time right?")
-    if step.size and step.max() > max(LONGEST_GAP, 2.0 / rate):
-        found = f"{step.max():.4g} s without a sample after {stamps[int(np.argmax(step))]:.4g} s"
-        raise DataError("time", str(path), found, f"gaps of at most {LONGEST_GAP:g} s: cut the log into two there")
-    t = np.arange(int(np.floor(stamps[-1] * rate + JITTER)) + 1) / rate
-    if len(t) == len(stamps) and np.all(np.abs(step * rate - 1) < JITTER):
-        return channels, t
-    keep = np.concatenate([[True], step > 0])
-    gaps = int(np.sum(step * rate > 1.5))
-    rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)
-    repeated = int(np.sum(np.all(rows[1:] == rows[:-1], axis=1)))
-    say(
-        f"{path.name}: {len(stamps)} stamped samples resampled to {len(t)} at {rate:g} Hz; {gaps} gaps, the longest "
-        f"{step.max() * 1e3:.3g} ms; {int(np.sum(~keep))} stamps twice, {repeated} samples that repeat the one before"
-    )
-    return {
-        k: np.stack([np.interp(t, stamps[keep], c[keep]) for c in v.T], axis=1) for k, v in channels.items()
-    }, t

@@ -1,6 +1,6 @@
 """A first map of a log, guessed from names, shapes and ranges, for a person to edit.
 
-Names say what a signal may be; ``guess_units`` says in which unit and on which side of the gear.
+``guess_names`` says what a signal may be by its name, ``guess_units`` in which unit and on which side of the gear.
 """
 
 from __future__ import annotations
@@ -13,32 +13,19 @@ from pathlib import Path
 import numpy as np
 import tomlkit
 
-from ident.convert.guess_units import NAMED_UNITS, Family, Scale, guess_scales, range_text
+from ident.convert.guess_names import CHANNELS, choose, families_of, oriented, score, words_of
+from ident.convert.guess_units import NAMED_UNITS, Family, Scale, guess_scales, range_text, unwrapped
 from ident.convert.mapping import UNITS
-from ident.convert.reading import VALUES, list_signals
+from ident.convert.reading import survey_log
+from ident.convert.spelling import split_unit, unit_of
+from ident.convert.texts import VALUES
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, linear_joints, load_robot
 
 SHORTEST = 20  # samples; anything shorter is no signal but a setting
 LARGEST = 1e30  # no stamp, in any unit, is beyond
 RATES = (20.0, 50e3)  # Hz: a log of an arm is sampled between
-CHANNELS = ("tau", "q", "qd", "q_ref", "q_link", "temp")
-# Words in names, and how surely each tells. One letter tells little.
-WORDS: dict[str, dict[str, float]] = {
-    "torque": dict.fromkeys(("tau", "torque", "torques", "trq", "effort", "efforts", "moment", "force", "current", "currents", "curr", "iq", "drehmoment", "strom", "kraft"), 3.0)
-    | dict.fromkeys(("cur", "voltage", "volt"), 2.0)
-    | dict.fromkeys(("u", "i", "f", "m"), 0.5),
-    "velocity": dict.fromkeys(("dq", "qd", "qdot", "qp", "vel", "velocity", "velocities", "omega", "speed", "rpm", "geschwindigkeit"), 3.0)
-    | dict.fromkeys(("v", "w"), 0.5),
-    "position": dict.fromkeys(("pos", "position", "positions", "theta", "phi", "angle", "angles", "encoder", "enc", "qm", "winkel", "weg"), 3.0)
-    | {"q": 2.5, "x": 0.5, "ql": 2.5, "qg": 2.5},
-    "temperature": dict.fromkeys(("temp", "temperature", "temperatur"), 3.0),
-}  # fmt: skip
-REFERENCE = ("ref", "cmd", "des", "desired", "command", "target", "setpoint", "goal", "soll", "qg")
-LINK = ("link", "load", "se", "secondary", "output", "arm", "abtrieb", "ql", "external")
-MOTOR = ("motor", "mot", "qm")
-ACTUAL = ("act", "actual", "meas", "measured", "ist", "rec", "state", "states", "read")
-DERIVED = ("err", "error", "ff", "feedforward", "acc", "acceleration", "ddq", "qdd", "model", "est", "sim", "init", "limit", "residual", "std")
+SECONDS = ("s", "ms", "us", "ns")
 TIMES = ("t", "time", "times", "stamp", "timestamp", "zeit", "secs", "sec")
 SETTINGS = {"fs": 1, "rate": 1, "sample_rate": 1, "frequency": 1, "dt": -1, "ts": -1, "sample_time": -1, "tsample": -1}
 
@@ -68,35 +55,37 @@ def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
     if not paths:
         raise DataError("files", "command line", "none", "at least one log")
     # Damaged values are no reason to guess nothing: the conversion names them.
-    logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in list_signals(p).items()} for p in paths]
+    surveys = [survey_log(p) for p in paths]
+    logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in s.signals.items()} for s in surveys]
     parts = _parts(paths, logs, arm.n)
-    signals = _joined(paths, logs, parts) if parts else logs[0]
+    starts = [f"{prefix}:" for prefix in parts] or [""]
+    units = {f"{p}{k}": u for p, s in zip(starts, surveys) for k, text in s.units.items() if (u := unit_of(text.strip("[](){}<> ")))}
+    dates = {f"{p}{k}" for p, s in zip(starts, surveys) for k in s.dates}
+    clocks = _clocks(logs, starts, units, dates, arm) if parts else {}
+    signals = _on_one_clock(logs, clocks) if clocks else _joined(logs, parts) if parts else logs[0]
     lengths = [_length(x) for x in signals.values() if _length(x) >= SHORTEST]
     if not lengths:
         raise DataError("log", str(paths[0]), f"no signal of {SHORTEST} samples or more", "columns of numbers")
     # The log has the length at which most values stand.
     N = max(set(lengths), key=lambda k: sum(x.size for x in signals.values() if _length(x) == k))
-    families = _families({k: x for k, x in signals.items() if _length(x) == N}, arm)
-    time, rate, time_unit = _time(families, signals, N, arm.n)
-    chosen, others = _choose([f for f in families if f.x.shape[1] == arm.n and f is not time], arm)
+    families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm)
+    time, rate, time_unit = _time(families, signals, dates) if not clocks else (None, min(c.rate for c in clocks.values()), "")
+    chosen, others = choose([f for f in families if f.x.shape[1] == arm.n and f is not time and f.name not in dates], arm)
+    if not {"tau", "q"} & set(chosen):
+        names = ", ".join(_plain(f.name) for f in families if f is not time)
+        raise DataError("signals", str(paths[0]), f"nothing that looks like a position or a torque of {arm.n} joints: {names[:300] or 'none'}", "names or units that tell, or a map by hand")
     linear = linear_joints(arm)
+    chosen = {c: unwrapped(f) if c in ("q", "q_ref", "q_link") and not np.any(linear) else f for c, f in chosen.items()}
     scales = guess_scales(chosen, arm, linear, rate)
-    text = _render(paths, arm, parts, time, time_unit, rate, chosen, others, scales, families, linear)
+    text = _render(paths, arm, parts, clocks, time, time_unit, rate, chosen, others, scales, families, linear)
     found = {c: f"{chosen[c].name}{', ' + ', '.join(s.options) if (s := scales[c]).options else ''}" for c in chosen}
-    if time is not None:
-        found["time"] = f"{time.name}, {rate:g} Hz"
+    if time is not None or clocks:
+        found["time"] = f"{time.name if time is not None else ', '.join(c.name for c in clocks.values())}, {rate:g} Hz"
     return GuessedMap(text, found, tuple(c for c in ("tau", "q") if c not in chosen))
 
 
 def _length(x: np.ndarray) -> int:
     return max(x.shape) if x.ndim else 0
-
-
-def _oriented(x: np.ndarray) -> np.ndarray:
-    """(N, k) with time first."""
-    if x.ndim < 2:
-        return x.reshape(-1, 1)
-    return x if x.shape[0] >= x.shape[1] else x.T
 
 
 # --- files of one log, or a log each
@@ -109,8 +98,9 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict
         if x is None or x.shape[1] > 1 or n == 1 or x.size % n:
             return {}
         return {paths[0].stem: (paths[0], n)}
-    scores = [_score(_words(name), channel) for name in logs[0] for channel in ("tau", "q")]
-    both = all(any(_score(_words(name), c) > 0 for name in logs[0]) for c in ("tau", "q"))
+    told = [split_unit(name) for name in logs[0]]
+    scores = [score(words_of(stem), channel, unit) for stem, unit in told for channel in ("tau", "q")]
+    both = all(any(score(words_of(stem), c, unit) > 0 for stem, unit in told) for c in ("tau", "q"))
     if scores and both:
         return {}
     shortest = min((_length(x) for log in logs for x in log.values() if _length(x) >= SHORTEST), default=0)
@@ -122,9 +112,43 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict
     return out
 
 
-def _joined(
-    paths: list[Path], logs: list[dict[str, np.ndarray]], parts: dict[str, tuple[Path, int | None]]
-) -> dict[str, np.ndarray]:
+@dataclass(frozen=True)
+class FileClock:
+    """The time column of one of several files: its name, rate in Hz, unit ("" of dates) and times in s."""
+
+    name: str
+    rate: float
+    unit: str
+    t: np.ndarray
+
+
+def _clocks(
+    logs: list[dict[str, np.ndarray]], starts: list[str], units: dict[str, str], dates: set[str], arm: Robot
+) -> dict[str, FileClock]:
+    """Prefix -> clock where each file has one of its own; else empty."""
+    out = {}
+    for log, start in zip(logs, starts, strict=True):
+        own = {k: units[f"{start}{k}"] for k in log if f"{start}{k}" in units}
+        time, rate, unit = _time(families_of(log, own, arm), log, {d.removeprefix(start) for d in dates if d.startswith(start)})
+        if time is None or rate is None:
+            return {}
+        out[start] = FileClock(time.sources[0][0], rate, unit, time.x[:, 0] * UNITS[unit or "s"])
+    return out
+
+
+def _on_one_clock(logs: list[dict[str, np.ndarray]], clocks: dict[str, FileClock]) -> dict[str, np.ndarray]:
+    """Signals of all files at the lowest of their rates, near enough for a guess: begun together."""
+    rate, end = min(c.rate for c in clocks.values()), min(c.t[-1] - c.t[0] for c in clocks.values())
+    t = np.arange(max(int(end * rate), SHORTEST)) / rate
+    out = {}
+    for log, (start, c) in zip(logs, clocks.items(), strict=True):
+        for name, x in log.items():
+            if name != c.name and _length(x) == len(c.t):
+                out[f"{start}{name}"] = np.stack([np.interp(t, c.t - c.t[0], column) for column in oriented(x).T], axis=1)
+    return out
+
+
+def _joined(logs: list[dict[str, np.ndarray]], parts: dict[str, tuple[Path, int | None]]) -> dict[str, np.ndarray]:
     out = {}
     for log, (prefix, (_, width)) in zip(logs, parts.items(), strict=True):
         for name, x in log.items():
@@ -132,115 +156,30 @@ def _joined(
     return out
 
 
-# --- names
+# --- time
 
 
-def _words(name: str) -> tuple[str, ...]:
-    """Parts of a name: "rec.actPos_mot1" gives rec, act, pos, mot; "Istposition" gives ist, position."""
-    name = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
-    words = (w.lower() for w in re.findall(r"[A-Za-zµ]+", name))
-    return tuple(part for w in words for part in _split(w))
-
-
-def _split(word: str) -> tuple[str, ...]:
-    """A word, or the two that it is put together of: a role and a quantity."""
-    quantities = [q for table in WORDS.values() for q in table if len(q) > 2]
-    for role in (*REFERENCE, *LINK, *MOTOR, *ACTUAL):
-        rest = word.removeprefix(role)
-        if len(role) > 2 and rest != word and any(rest.startswith(q) for q in quantities):
-            return role, rest
-    return (word,)
-
-
-def _families(signals: dict[str, np.ndarray], arm: Robot) -> list[Family]:
-    """Arrays of a column a joint, single columns numbered or named by joint, and what is left alone."""
-    n, out, single = arm.n, [], {}
-    for name, x in signals.items():
-        x = _oriented(x)
-        if x.shape[1] == 1:
-            single[name] = x[:, 0]
-        elif x.shape[1] >= n:
-            out.append(Family(name, _words(name), tuple((name, j) for j in range(n)), x[:, :n]))
-    if n == 1:
-        return out + [Family(k, _words(k), ((k, None),), x[:, None]) for k, x in single.items()]
-    sets: dict[str, dict[int, str]] = {}
-    for name in single:
-        # Longer joint names first: "joint_1" is also part of "joint_10".
-        joint = next((j for j in sorted(arm.joint_names, key=len, reverse=True) if j in name), None)
-        if joint is not None:
-            sets.setdefault(name.replace(joint, "{}", 1), {})[arm.joint_names.index(joint)] = name
-        for m in re.finditer(r"\d+", name):
-            sets.setdefault(name[: m.start()] + "{#}" + name[m.end() :], {})[int(m[0])] = name
-    used: set[str] = set()
-    for stem, members in sets.items():
-        first = 0 if 0 in members else 1
-        if "{#}" not in stem:
-            first = 0
-        names = [members.get(first + j) for j in range(n)]
-        if None in names or used & set(names):
-            continue
-        used |= set(names)
-        columns = np.stack([single[k] for k in names], axis=1)
-        out.append(Family(stem.replace("{#}", "#").replace("{}", "JOINT"), _words(stem), tuple((k, None) for k in names), columns))
-    return out + [Family(k, _words(k), ((k, None),), x[:, None]) for k, x in single.items() if k not in used]
-
-
-def _score(words: tuple[str, ...], channel: str) -> float:
-    """How well a name fits a channel; at most 0 where it does not."""
-    kind = {"tau": "torque", "qd": "velocity", "temp": "temperature"}.get(channel, "position")
-    fit = {k: max((v for w in words for word, v in table.items() if w == word or (len(word) > 3 and w.startswith(word))), default=0.0) for k, table in WORDS.items()}
-    score = fit[kind]
-    if score <= 0 or any(fit[k] > score for k in fit):
-        return 0.0
-    family = Family("", words, (), np.empty((0, 0)))
-    reference, link = family.has(REFERENCE), family.has(LINK)
-    if channel == "q_ref":
-        return score if reference and not family.has(DERIVED) else 0.0
-    if channel == "q_link":
-        return score if link and not reference and not family.has(DERIVED) else 0.0
-    score += family.has(ACTUAL) + 0.5 * family.has(MOTOR)
-    score -= 2.0 * reference + 2.4 * family.has(DERIVED) + (channel in ("q", "qd")) * 1.5 * link
-    return score
-
-
-def _choose(families: list[Family], arm: Robot) -> tuple[dict[str, Family], dict[str, list[Family]]]:
-    """The best family of each channel, and what else might be meant."""
-    moving = [f for f in families if np.all(np.isfinite(f.x)) and np.any(np.ptp(f.x, axis=0) > 0)]
-    chosen: dict[str, Family] = {}
-    others: dict[str, list[Family]] = {}
-    taken: set[str] = set()
-    for channel in CHANNELS:
-        ranked = sorted((f for f in moving if f.name not in taken and _score(f.words, channel) > 0), key=lambda f: -_score(f.words, channel))
-        if ranked:
-            chosen[channel] = ranked[0]
-            others[channel] = ranked[1:5]
-            taken.add(ranked[0].name)
-    left = [f for f in moving if f.name not in taken]
-    if "tau" not in chosen and "q" in chosen and len(left) == 1:
-        # A log for identification has a torque: it is the one that is left.
-        chosen["tau"], others["tau"] = left[0], []
-    return chosen, others
-
-
-def _time(families: list[Family], signals: dict[str, np.ndarray], N: int, n: int) -> tuple[Family | None, float | None, str]:
-    """The time column, the sampling rate in Hz and the unit of the column."""
-    best: tuple[tuple[bool, bool, int], Family, float, str] | None = None
+def _time(families: list[Family], signals: dict[str, np.ndarray], dates: set[str]) -> tuple[Family | None, float | None, str]:
+    """The time column, the sampling rate in Hz and the unit of the column, which dates need not have."""
+    best: tuple[tuple[int, bool, int], Family, float, str] | None = None
     for f in families:
-        if f.x.shape[1] != 1 or not any(w in TIMES or w.startswith("time") for w in f.words) or not np.all(np.isfinite(f.x)):
+        date = f.name in dates
+        told = date or f.unit in SECONDS or any(w in TIMES or w.startswith("time") for w in f.words)
+        if f.x.shape[1] != 1 or not told or not np.all(np.isfinite(f.x)):
             continue
         step = np.diff(f.x[:, 0])
         if np.any(step < 0) or not np.any(step > 0):
             continue
         median = float(np.median(step[step > 0]))
-        named = next((NAMED_UNITS[w] for w in f.words if NAMED_UNITS.get(w) in ("s", "ms", "us", "ns")), None)
-        for order, unit in enumerate([named] if named else ["s", "ms", "us", "ns"]):
+        named = f.unit if f.unit in SECONDS else next((NAMED_UNITS[w] for w in f.words if NAMED_UNITS.get(w) in SECONDS), None)
+        for order, unit in enumerate(["s"] if date else [named] if named else SECONDS):
             rate = 1.0 / (median * UNITS[unit])
             if RATES[0] <= rate <= RATES[1]:
                 # Whole numbers count samples more often than milliseconds.
                 counter = bool(median == 1.0 and np.all(step == 1.0))
-                key = (counter, "rec" not in f.words and "stamp" not in f.words, order)
+                key = (2 * counter + date, "rec" not in f.words and "stamp" not in f.words, order)
                 if best is None or key < best[0]:
-                    best = (key, f, _round_rate(rate, 0.05 if np.ptp(step) > 0.1 * median else 5e-3), unit)
+                    best = (key, f, _round_rate(rate, 0.05 if np.ptp(step) > 0.1 * median else 5e-3), "" if date else unit)
                 break
     if best is not None:
         return best[1], best[2], best[3]
@@ -268,6 +207,7 @@ def _render(
     paths: list[Path],
     arm: Robot,
     parts: dict[str, tuple[Path, int | None]],
+    clocks: dict[str, FileClock],
     time: Family | None,
     time_unit: str,
     rate: float | None,
@@ -289,9 +229,17 @@ def _render(
         lines += ["", "[roles]", *(f'{_quoted(p.name)} = "{"validation" if p is paths[-1] else "identification"}"' for p in paths)]
     if parts:
         lines += ["", "[files]                  # one log over several files; their signals are prefix:name"]
-        lines += [f"{_quoted(k)} = {{ name = {_quoted(p.name)}{f', width = {w}' if w else ''} }}" for k, (p, w) in parts.items()]
+        for prefix, (path, width) in parts.items():
+            options = [f"name = {_quoted(path.name)}", *([f"width = {width}"] if width else [])]
+            clock = clocks.get(f"{prefix}:")
+            if clock is not None:
+                options += [f"time = {_quoted(clock.name)}", *([f'unit = "{clock.unit}"'] if clock.unit else [])]
+            lines.append(f"{_quoted(prefix)} = {{ {', '.join(options)} }}")
+        if clocks:
+            lines.append("# Each has a time of its own: they are joined where all of them have samples.")
     if time is not None:
-        lines += ["", "[time]", f"source = {_quoted(time.sources[0][0])}", f'unit = "{time_unit}"']
+        lines += ["", "[time]", f"source = {_quoted(time.sources[0][0])}"]
+        lines += [f'unit = "{time_unit}"'] if time_unit else ["# dates, which need no unit"]
     lines += ["", "[columns]"]
     for channel in CHANNELS:
         if channel not in chosen:
@@ -302,7 +250,8 @@ def _render(
                 lines += [f'# {channel}_{j + 1} = {{ source = "...", unit = "{unit[int(linear[j])]}" }}' for j in range(arm.n)]
             continue
         family, scale = chosen[channel], scales[channel]
-        lines += ["", f"# {channel}: {scale.note}" if scale.note else f"# {channel}"]
+        notes = "; ".join(note for note in (family.note, scale.note) if note)
+        lines += ["", f"# {channel}: {notes}" if notes else f"# {channel}"]
         if others[channel]:
             lines.append("# might also be: " + ", ".join(_plain(f.name) for f in others[channel]))
         broken = channel == "qd" and "EDIT" in scale.note

@@ -7,7 +7,7 @@ must be the derivative of the position, and friction must take energy out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,8 @@ NAMED_UNITS = {
     "nm": "N m", "mnm": "mN m", "knm": "kN m", "ma": "mA", "amp": "A", "amps": "A", "volt": "V", "voltage": "V",
     "ns": "ns", "us": "us", "usec": "us", "ms": "ms", "msec": "ms", "s": "s", "sec": "s",
 }  # fmt: skip
+TURNS = {"rad": 2 * np.pi, "deg": 360.0, "mrad": 2e3 * np.pi, "rev": 1.0}  # a full turn, in the units that logs wrap in
+NEAR = 0.25  # of a turn, between two samples: a joint that is faster hides where it wraps
 CURRENTS = ("current", "currents", "curr", "cur", "strom", "iq")
 
 
@@ -30,12 +32,18 @@ class Family:
         words: lower-case parts of its names.
         sources: (n,) signal of each joint and its column, None for a signal of one column.
         x: (N, n) values as they stand in the log.
+        unit: that the log says, of a map; None where it says none.
+        note: what is doubtful about it.
+        wraps: whether the log has its angles within one turn; ``x`` then goes on over it.
     """
 
     name: str
     words: tuple[str, ...]
     sources: tuple[tuple[str, int | None], ...]
     x: np.ndarray
+    unit: str | None = None
+    note: str = ""
+    wraps: bool = False
 
     def has(self, vocabulary: Sequence[str]) -> bool:
         return any(w in vocabulary or any(len(v) > 2 and w.startswith(v) for v in vocabulary) for w in self.words)
@@ -80,21 +88,36 @@ def _before_gear(torque: np.ndarray, arm: Robot) -> bool:
 
 
 def _unit_of(family: Family, allowed: Sequence[str]) -> str | None:
+    if family.unit in allowed:
+        return family.unit
     return next((NAMED_UNITS[w] for w in family.words if NAMED_UNITS.get(w) in allowed), None)
+
+
+def unwrapped(family: Family) -> Family:
+    """Angles that jump by a full turn, going on over it; as they are where they do not, or where they jump otherwise too."""
+    named = _unit_of(family, tuple(TURNS))
+    for unit in (named,) if named else TURNS:
+        turn, size = TURNS[unit], np.abs(np.diff(family.x, axis=0))
+        jumps = np.abs(size - turn) < NEAR * turn
+        within = np.ptp(family.x, axis=0) < 1.02 * turn
+        if np.any(jumps) and np.all(within | ~np.any(jumps, axis=0)) and np.all(jumps | (size < NEAR * turn)):
+            return replace(family, x=np.unwrap(family.x, period=turn, axis=0), unit=unit, wraps=True)
+    return family
 
 
 def _position(family: Family, arm: Robot, linear: np.ndarray, rate: float | None, before: bool) -> Scale:
     """The first unit and side with which the motion fits the limits of place and speed."""
     meter = "m" if np.all(linear) else "rad"
     if np.all(linear):
-        named, choices = _unit_of(family, ("mm",)), [("m", "link"), ("mm", "link"), ("um", "link")]
+        named, choices = _unit_of(family, ("m", "mm", "um")), [("m", "link"), ("mm", "link"), ("um", "link")]
     else:
-        named = _unit_of(family, ("deg", "rad", "mrad"))
+        named = _unit_of(family, ("deg", "rad", "mrad", "rev"))
         choices = [("rad", "link"), ("deg", "link"), ("rad", "motor"), ("deg", "motor"), ("rev", "motor")]
         if before:
             choices[1], choices[2] = choices[2], choices[1]
     if named:
-        choices = [c for c in choices if c[0] == named] or [(named, "link")]
+        choices = [c for c in choices if c[0] == named] or [(named, "link"), (named, "motor")]
+    wraps = ("unwrap = true",) if family.wraps else ()
     room = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
     travel = np.ptp(family.x, axis=0)
     speed = np.percentile(np.abs(np.diff(family.x, axis=0)), 99, axis=0) * (rate or 0.0)
@@ -109,19 +132,23 @@ def _position(family: Family, arm: Robot, linear: np.ndarray, rate: float | None
     if not fitting:
         unit, side = choices[0]
         note = f"EDIT: no unit fits the limits of the joints; as it stands {range_text(family.x)}"
-        return Scale(np.full(arm.n, UNITS[unit]), _options(unit, side), note)
+        return Scale(np.full(arm.n, UNITS[unit]), _options(unit, side) + wraps, note)
     unit, side, factor = fitting[0]
     note = f"{unit} by the {'name' if named else 'range'}; {range_text(family.x * factor)} {meter}"
     # Small units always fit; only a neighbour of nearly the same size is a doubt.
     rival = next((c for c in fitting[1:] if np.median(np.abs(factor / c[2])) < 4.0), None)
     if rival is not None:
         note += f"; EDIT? {rival[0]} on the {rival[1]} side fits as well"
-    return Scale(factor, _options(unit, side), note)
+    if family.wraps:
+        note += "; wraps at a full turn: EDIT? by an offset, if it began in another one" if side == "motor" else "; wraps at a full turn"
+    return Scale(factor, _options(unit, side) + wraps, note)
 
 
 def _velocity(family: Family, velocity: np.ndarray | None, arm: Robot, linear: np.ndarray) -> Scale:
     """The unit, side and sign that make it the derivative of the position."""
     choices = ("m/s", "mm/s") if np.all(linear) else ("rad/s", "deg/s", "rpm")
+    named = _unit_of(family, choices)
+    choices = (named,) if named else choices
     if velocity is not None:
         slope = np.sum(velocity * family.x, axis=0) / np.maximum(np.sum(family.x**2, axis=0), 1e-300)
         moving = np.std(velocity, axis=0) > 1e-9
@@ -135,7 +162,7 @@ def _velocity(family: Family, velocity: np.ndarray | None, arm: Robot, linear: n
 
 
 def _torque_unit(family: Family, linear: np.ndarray) -> str:
-    unit = _unit_of(family, ("N m", "mN m", "kN m", "A", "mA", "V"))
+    unit = _unit_of(family, ("N m", "mN m", "kN m", "N", "kN", "A", "mA", "V"))
     return unit or ("A" if family.has(CURRENTS) else "N" if np.all(linear) else "N m")
 
 

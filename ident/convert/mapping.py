@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ UNITS = {
     "m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
     "degC": 1.0,
 }  # fmt: skip
+SMALLEST = 1e-15  # a factor that leaves nothing of any signal
 COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
 OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap", "plus"}
 KEYS = {"sample_rate", "input_hold", "time", "files", "columns", "multisine", "roles", "split"}
@@ -68,11 +69,16 @@ class FilePart:
     Attributes:
         pattern: file name, with * and ?.
         width: values of one sample, where the file has one value a line; else None.
+        time: its own time column, without the prefix; None where it has none. time_factor: s per unit of it.
+        shift: s, added to its time: clocks may begin apart.
     """
 
     prefix: str
     pattern: str
     width: int | None
+    time: str | None = None
+    time_factor: float = 1.0
+    shift: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,7 @@ class LogMap:
     def sources(self) -> set[str]:
         """Names of all signals that the map reads."""
         out = {s for c in self.columns for s in c.sources}
+        out |= {f"{f.prefix}:{f.time}" for f in self.files if f.time is not None}
         return out | {s for s in (self.time, self.excited_from) if s is not None}
 
 
@@ -153,12 +160,21 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
     if period is not None and lines and max(lines) >= period / 2:
         raise DataError("multisine.excited_lines", where, f"line {max(lines)}", f"lines below Nyquist, {period / 2:g}")
     roles = subtable(data, "roles", where)
+    files, source = tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items()), text(time, "source", where) if time else None
+    factor = _unit(time.get("unit", "s"), "time", where)
+    if files and source is not None and not any(source.startswith(f"{f.prefix}:") for f in files):
+        # A column of every file: each has a clock of its own.
+        files, source = tuple(f if f.time else replace(f, time=source, time_factor=factor) for f in files), None
+    clocks = [f.time is not None for f in files]
+    if any(clocks) and (source is not None or not all(clocks)):
+        found = f"none for {files[clocks.index(False)].prefix}" if source is None else f"[time] {source} as well"
+        raise DataError("time of [files]", where, found, "a time for each of the files, or one for all of them")
     return LogMap(
         sample_rate=number(data, "sample_rate", where, low=1e-3, high=1e7),
         input_hold=choice(data, "input_hold", where, ("zoh", "none"), "none"),
-        time=text(time, "source", where) if time else None,
-        time_factor=_unit(time.get("unit", "s"), "time", where),
-        files=tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items()),
+        time=source,
+        time_factor=factor,
+        files=files,
         columns=columns,
         period=period,
         parts=parts,
@@ -181,11 +197,15 @@ def _file(prefix: str, entry: Any, where: str) -> FilePart:
     if isinstance(entry, str):
         entry = {"name": entry}
     if not isinstance(entry, dict):
-        raise DataError(f"files.{prefix}", where, show(entry), '"name of a file" or { name = "...", width = 7 }')
+        raise DataError(f"files.{prefix}", where, show(entry), '"name of a file" or { name = "...", width = 7, time = "t", unit = "s" }')
+    here = f"{where} files.{prefix}"
     return FilePart(
         prefix,
-        text(entry, "name", f"{where} files.{prefix}"),
-        whole(entry, "width", f"{where} files.{prefix}", low=1, default=None),
+        text(entry, "name", here),
+        whole(entry, "width", here, low=1, default=None),
+        text(entry, "time", here) if "time" in entry else None,
+        _unit(entry.get("unit", "s"), f"files.{prefix}", where),
+        number(entry, "shift", here, default=0.0),
     )
 
 
@@ -216,6 +236,8 @@ def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
     ratio = number(entry, "gear", here, default=float(ratio))
     if ratio == 0 or factor == 0:
         raise DataError(key, where, "a factor of zero", "gear, sign, scale and torque_constant other than zero")
+    if abs(factor) < SMALLEST or abs(ratio) < SMALLEST:
+        raise DataError(key, where, f"a factor of {min(abs(factor), abs(ratio)):.3g}", f"unit, sign, scale, torque_constant and gear of at least {SMALLEST:g} in all")
     # Torques grow by the gear ratio on the way to the link, angles shrink; a temperature has no side.
     factor *= ratio if channel in ("tau", "r") else 1.0 if channel == "temp" else 1.0 / ratio
     unwrap = entry.get("unwrap", False)

@@ -2,33 +2,46 @@
 
 from __future__ import annotations
 
-import codecs
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Set
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv
 import pyarrow.parquet
 
+from ident.convert.dates import as_dates, dates_of_texts, seconds
+from ident.convert.texts import distinct, read_text, text_units
 from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
-VALUES = "values"  # name of the whole table of a text file without a header
-LOOKED_AT = 40  # lines of a text that say its delimiter and decimal sign
-LONGEST_LINE = 1 << 20  # characters of one
-ENCODING_BYTES = 1 << 16  # of a text that say how it is encoded
 DEEPEST = 8  # structures inside structures that are looked into
+MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
+MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
 Signals = dict[str, np.ndarray]
 
 
-def read_log(path: Path, wanted: set[str], time: str | None = None) -> Signals:
+@dataclass(frozen=True)
+class Survey:
+    """What a log holds.
+
+    Attributes:
+        signals: name -> numbers; of dates the seconds since the first.
+        units: name -> unit as the log writes it, where it does.
+        dates: names of those that are dates or times of the day.
+    """
+
+    signals: Signals
+    units: dict[str, str]
+    dates: frozenset[str]
+
+
+def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Signals:
     """The wanted signals of a log; a dot reaches into structures ("rec.act_pos").
 
     Args:
-        time: the one that may be dates.
+        times: those that may be dates, which come as datetime64 or timedelta64.
 
     Raises:
         DataError: where the file is missing, of another format, unreadable, or lacks a signal.
@@ -39,31 +52,51 @@ def read_log(path: Path, wanted: set[str], time: str | None = None) -> Signals:
         if name not in data:
             known = sorted(list_signals(path))
             raise DataError("signal", str(path), f"no {name}", f"one of {known[:30]}")
-        try:
-            x = np.asarray(data[name])
-        except ValueError as err:  # ragged
-            raise DataError("signal", str(path), f"{name} is no array of numbers", "numbers") from err
-        if x.dtype.kind not in ("fiubMm" if name == time else "fiub"):
-            raise DataError("signal", str(path), f"{name} is no array of numbers", "numbers")
-        out[name] = x.astype(float)
+        x = _array(data[name])
+        if x is None or x.dtype.kind not in ("fiuMm" if name in times else "fiu"):
+            raise DataError("signal", str(path), f"{name} is no array of numbers{_instead(x)}", "numbers")
+        out[name] = x if x.dtype.kind in "Mm" else x.astype(float)
     return out
 
 
-def list_signals(path: Path) -> Signals:
-    """All signals of a log that are numbers, single numbers included.
+def survey_log(path: Path) -> Survey:
+    """All signals of a log that are numbers or dates, single numbers included.
 
     Raises:
         DataError: where the file is missing, of another format or unreadable.
     """
-    out = {}
+    signals: Signals = {}
+    dates = set()
     for name, value in _read(path, None).items():
-        try:
-            x = np.asarray(value)
-            if x.dtype.kind in "fiub" and x.ndim <= 2:
-                out[name] = x.astype(float)
-        except (TypeError, ValueError):  # ragged
+        x = _array(value)
+        if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
-    return out
+        if x.dtype.kind in "Mm":
+            dates.add(name)
+            x = seconds(x, x.ravel()[0]) if x.size else x
+        signals[name] = x.astype(float)
+    units = text_units(path) if READERS[path.suffix.lower()] is read_text else {}
+    return Survey(signals, units, frozenset(dates))
+
+
+def list_signals(path: Path) -> Signals:
+    """The signals of ``survey_log``."""
+    return survey_log(path).signals
+
+
+def _array(value: Any) -> np.ndarray | None:
+    """An array, of dates where texts are dates; None where it is ragged."""
+    try:
+        x = np.asarray(value)
+        return dates_of_texts(x) if x.ndim == 1 and x.dtype.kind in "UO" and isinstance(next(iter(x), None), str) else x
+    except (TypeError, ValueError, pa.ArrowException):
+        return None
+
+
+def _instead(x: np.ndarray | None) -> str:
+    """What stands there, in words, where that can be told."""
+    kind = "" if x is None else x.dtype.kind
+    return {"b": " but of true and false", "M": " but of dates", "m": " but of times", "U": " but of texts"}.get(kind, "")
 
 
 def _read(path: Path, wanted: set[str] | None) -> dict[str, Any]:
@@ -82,99 +115,21 @@ def _read(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         raise DataError("log", str(path), f"unreadable ({reason})", "a complete file") from err
 
 
-def _csv(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    encoding = _encoding(path)
-    with path.open(encoding=encoding, errors="replace") as file:
-        first, *rows = (file.readline(LONGEST_LINE) for _ in range(LOOKED_AT))
-    if _numbers(first):
-        return _text(path, wanted)
-    delimiter = max(",;\t", key=first.count)
-    comma = delimiter != "," and any("," in x for x in rows) and not any("." in x for x in rows)
-    with pa.csv.open_csv(
-        path,
-        read_options=pa.csv.ReadOptions(encoding="utf8" if encoding == "utf-8-sig" else encoding),
-        parse_options=pa.csv.ParseOptions(delimiter=delimiter),
-        convert_options=pa.csv.ConvertOptions(decimal_point="," if comma else "."),
-    ) as reader:
-        names = [n.strip() for n in reader.schema.names]
-        _distinct(names, wanted, path)
-        keep = [i for i, n in enumerate(names) if wanted is None or n in wanted]
-        parts: dict[str, list[np.ndarray]] = {names[i]: [] for i in keep}
-        for batch in reader:
-            for i in keep:
-                parts[names[i]].append(batch.column(i).to_numpy(zero_copy_only=False))
-    return {n: np.concatenate(p) for n, p in parts.items() if p}
-
-
-def _encoding(path: Path) -> str:
-    """Of a text: UTF-16 by its mark, else UTF-8, or Latin-1 where it is none."""
-    with path.open("rb") as file:
-        head = file.read(ENCODING_BYTES)
-    if head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-        return "utf-16"
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(head)
-    except UnicodeDecodeError:
-        return "latin-1"
-    return "utf-8-sig"
-
-
-def _text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    """Numbers in rows, by blanks, commas, semicolons or tabs; names in a first line, or none."""
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        first = file.readline()
-    words = _words(first)
-    delimiter = next((c for c in ",;" if c in first), None)
-    header = not _numbers(first)
-    comments = None if header else ("#", "%")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy only warns of a file without numbers
-        x = np.loadtxt(path, delimiter=delimiter, skiprows=int(header), ndmin=2, comments=comments)
-    if not header:
-        return {VALUES: x}
-    if len(words) != x.shape[1]:
-        raise ValueError(f"{len(words)} names over {x.shape[1]} columns")
-    _distinct(words, wanted, path)
-    return {n: x[:, i] for i, n in enumerate(words)}
-
-
-def _distinct(names: list[str], wanted: set[str] | None, path: Path) -> None:
-    """Raise a DataError where a signal that is wanted stands in two columns."""
-    double = sorted({n for n in names if names.count(n) > 1 and (wanted is None or n in wanted)}) if len(set(names)) < len(names) else []
-    if double:
-        raise DataError("signal", str(path), f"{double[0]} twice", "each signal once")
-
-
-def _words(line: str) -> list[str]:
-    for c in ",;\t":
-        if c in line:
-            return [w.strip() for w in line.strip().strip("#%").split(c)]
-    return line.strip("#% \n").split()
-
-
-def _numbers(line: str) -> bool:
-    """Whether a line holds numbers alone."""
-    try:
-        return len([float(w) for w in _words(line)]) > 0
-    except ValueError:
-        return False
-
-
 def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     file = pa.parquet.ParquetFile(path)
     schema = file.schema_arrow
-    _distinct(schema.names, wanted, path)
+    distinct(schema.names, wanted, path)
     names = [n for n in schema.names if (wanted is None or n in wanted) and _holds_numbers(schema.field(n).type)]
     check_size(path, 8 * file.metadata.num_rows * len(names))
     table = file.read(columns=names)
-    return {n: table.column(n).to_numpy() for n in table.column_names}
+    return {n: as_dates(table.column(n)) for n in table.column_names}
 
 
 def _holds_numbers(kind: pa.DataType) -> bool:
-    """Whether values of a type are numbers or dates."""
+    """Whether values of a type are numbers, dates, or texts that may be dates."""
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
-    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_temporal)
+    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_temporal, pa.types.is_string, pa.types.is_large_string)
     return any(test(kind) for test in tests)
 
 
@@ -198,6 +153,9 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         if hasattr(value, "_fieldnames"):
             for key in value._fieldnames if depth < DEEPEST else []:
                 walk(f"{name}.{key}", getattr(value, key), depth + 1)
+        elif isinstance(value, np.ndarray) and value.dtype == object and value.size and depth < DEEPEST:
+            for key, part in _elements(name, value.ravel()):
+                walk(key, part, depth + 1)
         elif wanted is None or name in wanted:
             out[name] = value
 
@@ -207,20 +165,48 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return out
 
 
+def _elements(name: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
+    """Parts of an array of structures or cells, named as MATLAB does; a structure a sample is an array a field."""
+    structures = hasattr(array[0], "_fieldnames")
+    if len(array) <= MOST_ELEMENTS:
+        brackets = "()" if structures else "{}"
+        yield from ((f"{name}{brackets[0]}{k + 1}{brackets[1]}", part) for k, part in enumerate(array))
+        return
+    for field in array[0]._fieldnames if structures else ():
+        parts = [np.asarray(getattr(part, field, None)) for part in array]
+        if all(p.shape == parts[0].shape and p.dtype.kind in "fiu" for p in parts):
+            yield f"{name}.{field}", np.stack(parts)
+
+
 def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
     """Arrays of numbers of a MATLAB 7.3 file."""
     import h5py
 
     found: dict[str, Any] = {}
+    groups, items = set(), 0
 
-    def visit(name: str, item: Any) -> None:
-        dotted = name.replace("/", ".")
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and not name.startswith("#"):
-            text = item.attrs.get("MATLAB_class", b"") == b"char"
-            if not text and not item.attrs.get("MATLAB_empty", 0) and (wanted is None or dotted in wanted):
-                found[dotted] = item
+    def walk(group: Any, start: str, depth: int) -> None:
+        nonlocal items
+        address = h5py.h5o.get_info(group.id).addr
+        if depth > DEEPEST or address in groups:  # a group may hold itself
+            return
+        groups.add(address)
+        for name in group:
+            items += 1
+            if items > MOST_ITEMS:
+                raise DataError("log", str(path), f"more than {MOST_ITEMS} groups and arrays", "a recording")
+            # Where MATLAB keeps what cells hold; and links, which may lead out of the file.
+            if (name.startswith("#") and not start) or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue
+            item, dotted = group[name], f"{start}{name}"
+            if isinstance(item, h5py.Group):
+                walk(item, f"{dotted}.", depth + 1)
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and (wanted is None or dotted in wanted):
+                text = item.attrs.get("MATLAB_class", b"") == b"char"
+                if not text and not item.attrs.get("MATLAB_empty", 0):
+                    found[dotted] = item
 
-    file.visititems(visit)
+    walk(file, "", 0)
     for name, item in found.items():
         if item.external or item.is_virtual:
             raise DataError("signal", str(path), f"{name}, which stands in another file", "one in the file itself")
@@ -244,7 +230,7 @@ def _db3(path: Path, wanted: set[str] | None) -> dict[str, Any]:
 
 
 READERS: dict[str, Callable[[Path, set[str] | None], dict[str, Any]]] = {
-    ".csv": _csv, ".txt": _text, ".dat": _text, ".tsv": _text, ".parquet": _parquet, ".mat": _mat, ".npz": _npz,
+    ".csv": read_text, ".txt": read_text, ".dat": read_text, ".tsv": read_text, ".parquet": _parquet, ".mat": _mat, ".npz": _npz,
     ".mcap": _mcap, ".db3": _db3,
 }  # fmt: skip
 FORMATS = tuple(READERS)

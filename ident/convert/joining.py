@@ -1,0 +1,68 @@
+"""Files of one log whose clocks are their own, brought onto one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
+from ident.convert.mapping import LogMap
+from ident.segment_file import SHORTEST
+from robot_assets.errors import DataError
+
+
+def on_one_clock(
+    data: dict[str, np.ndarray], m: LogMap, paths: dict[str, Path], say: Callable[[str], None]
+) -> tuple[dict[str, np.ndarray], list[Stamps], float]:
+    """Signals of files with stamps of their own at the times that all of them have.
+
+    Returns:
+        data: signals (N, k). clocks: of each file. start: s, of the first sample on these clocks.
+    """
+    stamps = {f.prefix: data[f"{f.prefix}:{f.time}"].ravel() for f in m.files}
+    first = m.files[0].prefix
+    for f in m.files:
+        if not stamps[f.prefix].size or stamps[f.prefix].dtype.kind != stamps[first].dtype.kind:
+            kinds = {"M": "dates", "m": "times of the day"}
+            found = kinds.get(stamps[f.prefix].dtype.kind, "numbers") if stamps[f.prefix].size else "no stamps"
+            raise DataError(f"{f.prefix}:{f.time}", str(paths[f.prefix]), found, f"stamps like those of {first}")
+    dates = stamps[first].dtype.kind in "Mm"
+    clocks = {}
+    for f in m.files:
+        x, origin = stamps[f.prefix], stamps[first][0]
+        # Numbers may be of several units, and count from one origin.
+        s = stamp_seconds(x, 1.0, origin) if dates else x * f.time_factor - origin * m.files[0].time_factor
+        clocks[f.prefix] = check_stamps(s + f.shift, m.sample_rate, paths[f.prefix])
+    last = max(clocks, key=lambda k: clocks[k].t[0])
+    soonest = min(clocks, key=lambda k: clocks[k].t[-1])
+    start, end = float(clocks[last].t[0]), float(clocks[soonest].t[-1])
+    if (end - start) * m.sample_rate < SHORTEST - 1:
+        found = f"{paths[soonest].name} ends {start - end:.4g} s before {paths[last].name} begins" if end < start else f"{end - start:.3g} s in common"
+        raise DataError("time of [files]", str(paths[last]), found, "spans that overlap (shift = seconds in [files] moves one)")
+    t = uniform_times(start, end, m.sample_rate)
+    out = dict(data)
+    for f in m.files:
+        prefix, clock = f"{f.prefix}:", clocks[f.prefix]
+        own = {k: x for k, x in data.items() if k.startswith(prefix) and k != f"{prefix}{f.time}"}
+        signals = {k: _by_time(x, len(clock.t), k, paths[f.prefix]) for k, x in own.items()}
+        for c in m.columns:
+            x = signals.get(c.source) if c.turn is not None else None
+            k = 0 if x is None or x.shape[1] == 1 else c.index
+            if x is not None and k < x.shape[1]:
+                # Before samples are put between: halfway between two ends of a turn is nowhere.
+                signals[c.source] = np.concatenate([x[:, :k], np.unwrap(x[:, [k]], period=c.turn, axis=0), x[:, k + 1 :]], axis=1)
+        if signals and not at_times(clock, t, m.sample_rate):
+            say(f"{paths[f.prefix].name}: {changed(clock, np.concatenate(list(signals.values()), axis=1), len(t), m.sample_rate)}")
+            signals = {k: resample(x, clock, t, m.sample_rate) for k, x in signals.items()}
+        out |= signals
+    return out, list(clocks.values()), start
+
+
+def _by_time(x: np.ndarray, N: int, name: str, path: Path) -> np.ndarray:
+    """(N, k) of a source that has a sample a stamp."""
+    x = x.reshape(-1, 1) if x.ndim < 2 else x if len(x) == N else x.T
+    if len(x) != N or x.ndim > 2:
+        raise DataError(name, str(path), f"{len(x)} samples", f"one for each of {N} time stamps")
+    return x
