@@ -5,15 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.published import references
 from ident.checking import inspect_dataset
 from ident.convert import convert_logs
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnosis import diagnose_fully, set_up
-from ident.hypotheses.friction import direction
+from ident.diagnosis import diagnose_fully
 from robot_assets.errors import DataError
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT.parent / "shared" / "data" / "twomass_multisine_fditools"
+MORE_THAN_REFERENCE = {"staubli_tx40": 1.8}  # times the error of the best reference; less than that elsewhere
 MAP = ROOT / "ident" / "convert" / "maps" / "twomass_multisine_fditools.toml"
 
 
@@ -74,17 +75,6 @@ def test_time_stamps_are_resampled_on_a_uniform_grid(tmp_path):
     assert np.abs(s.tau[:, 0] - np.sin(s.t)).max() < 1e-3
 
 
-def emps_as_published(data):
-    """Error on the held-out run, in the compared band, of M = 95.109 kg, Fv = 203.50 N s/m, Fc = 20.394 N and -3.165 N; N."""
-    (group,) = set_up(data).held_out
-    s, q = 1j * group.omega, group.Q[0, :, 0]
-    v = group.to_time((s * q)[:, None])[:, 0]
-    friction = group.to_lines((20.394 * direction(v[None], 1e-4)[0] - 3.165)[:, None])[:, 0]
-    force = 95.109 * s**2 * q + 203.50 * s * q + friction
-    error = np.abs(group.observe((group.U[0, :, 0] - force)[:, None])[:, 0])
-    return np.sqrt((error[0] ** 2 + 2.0 * np.sum(error[1:] ** 2)) / np.mean(group.window**2))
-
-
 def named(verdict):
     return {(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5}
 
@@ -113,13 +103,14 @@ def test_real_motions_get_causes_that_their_publishers_know(folder, robot, files
     verdict = diagnose_fully(data, max_causes=max_causes).verdict
     assert verdict.gain.after < left * verdict.gain.before
     assert verdict.unexplained_verdict == "unknown cause remains"
+    reference = references(data, DATA.parent / folder).best.over_all
+    assert verdict.gain.over_all[1] < MORE_THAN_REFERENCE.get(folder, 1.0) * reference
     frictions = {"coulomb_friction", "presliding_friction", "stribeck_friction"}
     rubbing = {j for e, j in named(verdict) if e in frictions}
     others = {(e, j) for e, j in named(verdict) if e not in frictions}
     if folder == "emps_drive":
         torque = next(c for c in verdict.causes if c.effect == "coulomb_friction").parameters["torque"].value
         assert rubbing == {"screw"} and torque == pytest.approx(20.39, rel=0.1)
-        assert verdict.gain.after < emps_as_published(data)
     if folder == "kuka_kr300_dual_encoder":
         late = {c.joint: c.parameters["delay"].value for c in verdict.causes if c.effect == "sensor_delay"}
         assert all(late[j] == pytest.approx(3e-3, abs=0.2e-3) for j in ("axis_2", "axis_3"))
