@@ -442,7 +442,7 @@ def leave_one_out(
                 links = fit_rigid(build_structure(problem.structure.robot), nominal, part.groups)
                 model, of = replace(model, structure=links.structure), replace(part, nominal=links.par)
             models.append(fit(of, model, iterations=4, remainders=remainders).model)
-        return segment_errors(problem, problem.groups[i : i + 1], *models)[0]
+        return segment_errors(problem, problem.groups[i : i + 1], *models, alone=False)[0]
 
     errors = workers.map(without, range(len(problem.groups)))
     joined = Errors(
