@@ -67,6 +67,7 @@ SETTLED = 0.05  # share of the excess up to which what is left needs no second s
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
+LINEAR_SHARE = 0.5 * MIN_SHARE  # of what is left at a joint, from which a friction is fitted there too: a step at a few shapes shows half of it
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record or found so far, from which its loop is begun
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
@@ -386,8 +387,8 @@ def companions(
     """A friction just named at other joints too, where at least two of them ask for it: a real arm has it at all.
 
     Nothing else: what one ripple shakes at all joints, others of periods found freely would each explain at their own.
-    Each must explain ``MIN_SHARE`` of what is left at its own joint, and all are fitted together. A single
-    one is left to the next round, where it competes.
+    Each must explain ``LINEAR_SHARE`` of what is left at its own joint by a linear step, and ``MIN_SHARE`` once all
+    are fitted together. A single one is left to the next round, where it competes.
 
     Returns:
         The model with them, and a round for each; ``current`` and none where there are none.
@@ -402,7 +403,7 @@ def companions(
     scores = [
         s
         for s in screen(problem, current, preds, same)
-        if s.start is not None and s.gain > MIN_SHARE * left[s.hypothesis.joint]
+        if s.start is not None and s.gain > LINEAR_SHARE * left[s.hypothesis.joint]
     ]
     if len(scores) < 2:
         return current, []
