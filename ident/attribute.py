@@ -451,10 +451,13 @@ def without_shadows(problem: Problem, current: Fit, rounds: Sequence[Round], wor
         other = refit(problem, without(gone), current.weights, current.remainders, POLISH_STEPS)
         return np.inf if other is None else other.cost - current.cost
 
-    least = MIN_EVIDENCE * max(1.0, current.chi2_per_dof)
+    def least(h: Hypothesis) -> float:
+        """By what is left at its own joint: what is left at another, far above a smaller noise, says nothing of it."""
+        return MIN_EVIDENCE * max(1.0, current.costs[h.joint] / current.counts[h.joint])
+
     rises = workers.map_in_time(lambda h: rise([h]), doubted, lambda h: f"without: {h.effect} at {h.place}")
-    gone = [h for h, x in zip(doubted, rises, strict=True) if x is not None and x < least]
-    if not gone or (len(gone) > 1 and rise(gone) >= least * len(gone)):
+    gone = [h for h, x in zip(doubted, rises, strict=True) if x is not None and x < least(h)]
+    if not gone or (len(gone) > 1 and rise(gone) >= sum(map(least, gone))):
         return current
     return polish(problem, replace(current, model=without(gone)))
 
