@@ -103,7 +103,7 @@ MACHINES = (
         "Staubli TX40, coupled wrist",
         "figaroh-examples (Apache-2.0 by its README). A-priori Coulomb friction of its configuration, joints 1 to 6:"
         " 7.14, 8.26, 6.34, 2.48, 3.03 and 0.28 N m; viscous 8.05, 5.53, 1.97, 1.11, 1.86 and 0.65 N m s/rad.",
-        1,
+        2,
     ),
 )
 
