@@ -9,7 +9,7 @@ Systems 14, 1997; Janot, Vandanjon and Gautier, IEEE Trans. Control Syst. Techno
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ TRUNCATIONS = (1e-6, 1e-2, 3e-2)  # singular values over the largest, left out: 
 EMPS_CUTOFF, EMPS_DECIMATION = 100.0, 10  # Hz, and samples, of the publishers' relative error (their Script_IDIM_LS.m)
 EMPS_BORDER = 50  # samples left out there at either end
 
+UR10_LOW_PASS = 2.0  # Hz, about: above it the published recording of the UR10 holds nothing
 # figaroh-examples, examples/staubli_TX40 (TX40_config.yaml), joints 1 to 6: Coulomb N m, viscous N m s/rad, motor kg m2.
 TX40_COULOMB = np.array([7.14, 8.26, 6.34, 2.48, 3.03, 0.28])
 TX40_VISCOUS = np.array([8.05, 5.53, 1.97, 1.11, 1.86, 0.65])
@@ -68,6 +69,7 @@ class Motion:
         rest: (N, n) where a joint stands still.
         window: (N,) weight in time.
         period: samples over which lines are taken; lines are 0 .. ``lines`` - 1.
+        low_pass_hz: cut-off of a low pass that the recording has seen before it was published, or None.
     """
 
     role: str
@@ -79,6 +81,7 @@ class Motion:
     window: np.ndarray
     period: int
     lines: int
+    low_pass_hz: float | None = None
 
     @property
     def band_hz(self) -> float:
@@ -149,11 +152,15 @@ def _motion(dataset: Dataset, name: str, group: Group) -> Motion:
     return Motion(segment.role, segment.q, segment.tau, segment.t, rate, rest, window, period, group.n_compared)
 
 
+def low_pass(motion: Motion, cutoff: float) -> np.ndarray:
+    """Sections of a Butterworth filter with a cut-off in Hz."""
+    return scipy.signal.butter(ORDER, min(2.0 * cutoff / motion.rate, 0.95), output="sos")
+
+
 def filtered(motion: Motion, cutoff: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position, velocity and acceleration (N, n), low-passed at a cut-off in Hz."""
-    low_pass = scipy.signal.butter(ORDER, min(2.0 * cutoff / motion.rate, 0.95), output="sos")
     pad = min(len(motion.q) - 1, int(PAD * motion.rate / cutoff))
-    q = scipy.signal.sosfiltfilt(low_pass, motion.q, axis=0, padlen=pad)
+    q = scipy.signal.sosfiltfilt(low_pass(motion, cutoff), motion.q, axis=0, padlen=pad)
     v = np.gradient(q, 1.0 / motion.rate, axis=0)
     return q, v, np.gradient(v, 1.0 / motion.rate, axis=0)
 
@@ -169,7 +176,10 @@ def columns(model: pin.Model, motion: Motion) -> np.ndarray:
     data = model.createData()
     each = [pin.computeJointTorqueRegressor(model, data, *x) for x in zip(q, v, a, strict=True)]
     bodies = np.reshape(each, (*q.shape, -1))  # of one joint it comes without its axis
-    drives = [x[:, :, None] * np.eye(q.shape[1]) for x in (a, v, np.sign(v), np.ones_like(v))]
+    rubbing = np.sign(v)
+    if motion.low_pass_hz is not None:  # of the torques the low pass has rounded off what a velocity turns on at once
+        rubbing = scipy.signal.sosfiltfilt(low_pass(motion, motion.low_pass_hz), rubbing, axis=0)
+    drives = [x[:, :, None] * np.eye(q.shape[1]) for x in (a, v, rubbing, np.ones_like(v))]
     return np.concatenate([bodies, *drives], axis=2)
 
 
@@ -304,6 +314,9 @@ def references(dataset: Dataset, folder: Path) -> References | None:
     given = motions(dataset)
     model = build_structure(dataset.robot).model
     found = [*plain(model, given)]
+    if folder.name == "ur10_unisa":
+        rounded = plain(model, [replace(m, low_pass_hz=UR10_LOW_PASS) for m in given])
+        found += [replace(r, name=f"{r.name}, friction low-passed") for r in rounded]
     if folder.name == "emps_drive":
         found.append(evaluated("publishers' least squares", emps_force, given))
     if folder.name == "staubli_tx40":
