@@ -67,6 +67,7 @@ SETTLED = 0.05  # share of the excess up to which what is left needs no second s
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
+LINEAR_SHARE = 0.5 * MIN_SHARE  # of what is left at a joint, from which a friction is fitted there too: a step at a few shapes shows half of it
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record or found so far, from which its loop is begun
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
@@ -386,8 +387,8 @@ def companions(
     """A friction just named at other joints too, where at least two of them ask for it: a real arm has it at all.
 
     Nothing else: what one ripple shakes at all joints, others of periods found freely would each explain at their own.
-    Each must explain ``MIN_SHARE`` of what is left at its own joint, and all are fitted together. A single
-    one is left to the next round, where it competes.
+    Each must explain ``LINEAR_SHARE`` of what is left at its own joint by a linear step, and ``MIN_SHARE`` once all
+    are fitted together. A single one is left to the next round, where it competes.
 
     Returns:
         The model with them, and a round for each; ``current`` and none where there are none.
@@ -402,7 +403,7 @@ def companions(
     scores = [
         s
         for s in screen(problem, current, preds, same)
-        if s.start is not None and s.gain > MIN_SHARE * left[s.hypothesis.joint]
+        if s.start is not None and s.gain > LINEAR_SHARE * left[s.hypothesis.joint]
     ]
     if len(scores) < 2:
         return current, []
@@ -450,10 +451,14 @@ def without_shadows(problem: Problem, current: Fit, rounds: Sequence[Round], wor
         other = refit(problem, without(gone), current.weights, current.remainders, POLISH_STEPS)
         return np.inf if other is None else other.cost - current.cost
 
-    least = MIN_EVIDENCE * max(1.0, current.chi2_per_dof)
+    def least(h: Hypothesis) -> float:
+        """By what is left at its own joint: what is left at another, far above a smaller noise, says nothing of it."""
+        left = current.chi2_per_dof if h.on_chain else current.costs[h.joint] / current.counts[h.joint]
+        return MIN_EVIDENCE * max(1.0, left)
+
     rises = workers.map_in_time(lambda h: rise([h]), doubted, lambda h: f"without: {h.effect} at {h.place}")
-    gone = [h for h, x in zip(doubted, rises, strict=True) if x is not None and x < least]
-    if not gone or (len(gone) > 1 and rise(gone) >= least * len(gone)):
+    gone = [h for h, x in zip(doubted, rises, strict=True) if x is not None and x < least(h)]
+    if not gone or (len(gone) > 1 and rise(gone) >= sum(map(least, gone))):
         return current
     return polish(problem, replace(current, model=without(gone)))
 

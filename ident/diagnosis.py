@@ -33,7 +33,7 @@ from ident.parallel import Workers, one_thread_each
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
-from ident.rigid import RigidFit, fit_rigid
+from ident.rigid import RigidFit, carried_over, fit_rigid
 from ident.torque_checks import mislabelled
 from ident.torque_fit import NOT_COMPUTED, Fit, Problem, data_count, fit, predictions
 from ident.trust import LEFT_ERROR, denied, known_probability
@@ -47,6 +47,7 @@ POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
 SETTLED_BY_INERTIAS = 0.7  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
+CARRIED_OVER = 0.9  # squares of the torque left with inertias found, over those with inertias described, on parts left out, that are worth them
 HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
 LEAST_HELD_OUT = 2.0  # s of it
 RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
@@ -395,11 +396,13 @@ def with_inertias(
     """Causes sought anew with inertias of the links and offsets of the torque found from motions, where that explains far more.
 
     The links of a real arm are not those of its description, torque records have offsets, and friction is
-    judged wrongly beside both.
+    judged wrongly beside both. Short motions fit well with other inertias that foretell nothing: parts of them left out say so.
     """
     workers.say("inertias of the links")
     problem = setup.problem
     try:
+        if carried_over(problem.structure, problem.nominal, problem.groups) > CARRIED_OVER:
+            return setup, result, None
         rigid = fit_rigid(problem.structure, problem.nominal, problem.groups)
         problem = replace(problem, structure=rigid.structure, nominal=rigid.par)
         offsets = tuple(Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names))
@@ -442,7 +445,7 @@ def leave_one_out(
                 links = fit_rigid(build_structure(problem.structure.robot), nominal, part.groups)
                 model, of = replace(model, structure=links.structure), replace(part, nominal=links.par)
             models.append(fit(of, model, iterations=4, remainders=remainders).model)
-        return segment_errors(problem, problem.groups[i : i + 1], *models)[0]
+        return segment_errors(problem, problem.groups[i : i + 1], *models, alone=False)[0]
 
     errors = workers.map(without, range(len(problem.groups)))
     joined = Errors(

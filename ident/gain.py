@@ -19,9 +19,9 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean squared torque error of each segment, or each stretch of a motion, and joint, N2 m2; each (rows, n).
+    """Mean squared torque error of each segment, each stretch of a motion or each line, and joint, N2 m2; each (rows, n).
 
-    ``segments``: of the rows, a motion as often as it has stretches.
+    ``segments``: of the rows, a motion as often as it has stretches, a single periodic record as often as it has lines.
     """
 
     segments: tuple[str, ...]
@@ -31,15 +31,22 @@ class Errors:
 
 
 def segment_errors(
-    problem: Problem, groups: Sequence[Group], before: Model, after: Model
+    problem: Problem, groups: Sequence[Group], before: Model, after: Model, *, alone: bool = True
 ) -> tuple[Errors, list[tuple[Prediction, Prediction]]]:
     """Prediction errors in the compared band, before and after, and the noise in it.
 
     Along a motion too large for a model its links cannot be solved; such a group is left out of the
     errors of both models, and of the pairs of predictions. Where there are motions alone, each is cut into
-    ``STRETCHES``: one of them says by its parts how much chance there is in what is gained.
+    ``STRETCHES``: one of them says by its parts how much chance there is in what is gained. A periodic record that stands
+    alone says it by its lines: under random phases errors at different lines are independent (Pintelon and Schoukens
+    2012, ch. 3). Its periods do not: the error of the model is the same in each, and they would show noise alone.
+
+    Args:
+        alone: whether the groups are all that is held out.
     """
-    parts = STRETCHES if all(group.window is not None for group in groups) else 1
+    motions = all(group.window is not None for group in groups)
+    parts = STRETCHES if motions else 1
+    by_line = alone and not motions and sum(len(group.segments) for group in groups) == 1
     names: list[str] = []
     out: list[list[np.ndarray]] = [[], [], []]
     pairs = []
@@ -53,6 +60,11 @@ def segment_errors(
         S = noise_covariance(problem, group, b)
         share = group.window_share
         noise = share * np.einsum("kii->ki", S).real
+        if by_line:
+            names += group.segments * group.n_compared
+            for store, lines in zip(out, (*(np.abs(group.observe(group.U - p.U)[0]) ** 2 for p in (a, b)), noise), strict=True):
+                store.append(line_squares(lines))
+            continue
         names += [name for name in group.segments for _ in range(parts)]
         for store, pred in ((out[0], a), (out[1], b)):
             e = group.observe(group.U - pred.U)
@@ -65,6 +77,11 @@ def segment_errors(
 def mean_squares(lines: np.ndarray) -> np.ndarray:
     """Mean squares (S, n) of signals from the squared moduli (S, K, n) of their lines, line 0 first."""
     return lines[:, 0] + 2 * lines[:, 1:].sum(axis=1)
+
+
+def line_squares(lines: np.ndarray) -> np.ndarray:
+    """Shares of lines (K, n) in a mean square, from their squared moduli (K, n), line 0 first; their mean over lines is that square."""
+    return len(lines) * np.concatenate([lines[:1], 2.0 * lines[1:]])
 
 
 def stretch_squares(group: Group, lines: np.ndarray, parts: int) -> np.ndarray:
@@ -88,7 +105,10 @@ def measure_gain(
 ) -> Gain | None:
     """Rms errors, share of the gap to the noise floor that is closed, and its 95 % interval.
 
-    The interval is a percentile bootstrap over segments, or over stretches of motions. None where no segment could be predicted.
+    The interval is a percentile bootstrap over segments, over stretches of motions, or over the lines of a single periodic
+    record: what other phases of the same excitation would show in that posture, and nothing of other postures. It is as wide
+    as errors of one size at all lines ask for, and wider than needed where few of them hold most. None where no segment could be
+    predicted.
 
     Args:
         affected: the joints over which errors are taken: those that carry the discrepancy in the

@@ -34,6 +34,8 @@ REWEIGHTINGS = 4  # of the joints
 STEPS = 25  # of Levenberg-Marquardt under each
 RANK = 1e-3  # singular value of the whitened regressor, over the largest, that counts as shown
 LEAST_SHARE = 1e-6  # of the size of a pseudo-inertia, added where a described body has none
+PARTS = 4  # of a motion, left out in turn to see how inertias carry over
+CROSSING = 0.3  # s, over which such a part fades at its cuts
 SLOW = 0.002  # of the rms velocity, over which friction turns
 
 
@@ -102,6 +104,55 @@ def fit_rigid(structure: Structure, nominal: Parameters, groups: Sequence[Group]
         nominal, inertia=np.exp(x[COORDINATES * B :][:n]), viscous=np.exp(x[COORDINATES * B + n :])
     )
     return RigidFit(changed, par, std, names, problem.rank(), rms)
+
+
+def carried_over(structure: Structure, nominal: Parameters, groups: Sequence[Group]) -> float:
+    """What inertias found leave of parts of the motions that were left out, over what those described leave there.
+
+    ``PARTS`` of every motion are left out in turn; of the squares of the torque at each joint a geometric mean over the joints.
+    Above 1 the motions are too short or too poor for so many parameters, however well these fit. Motor inertia, friction and
+    offset are fitted under both.
+
+    Args:
+        structure, nominal, groups: as of ``fit_rigid``.
+    """
+    indices = [i for i in structure.carriers.values() if structure.model.inertias[i].mass > 0]
+
+    def rows(part: Sequence[Group]) -> list[np.ndarray]:
+        each = [_rows(structure, nominal.coupling, group, indices) for group in part]
+        return [np.concatenate(x) for x in zip(*each, strict=True)]
+
+    left = np.zeros((2, structure.n))
+    for part in range(PARTS):
+        kept, out = ([_cut(group, part, inside) for group in groups] for inside in (False, True))
+        found = fit_rigid(structure, nominal, kept).structure.model
+        given, other = rows(kept), rows(out)
+        left += [_left_with(model, indices, given, other) for model in (found, structure.model)]
+    return float(np.exp(np.mean(np.log(left[0] / np.maximum(left[1], 1e-300)))))
+
+
+def _cut(group: Group, part: int, inside: bool) -> Group:
+    """A motion seen through its window in one of ``PARTS`` of time, or outside of it; both fade at the cuts."""
+    time = np.arange(group.n_time) * group.period_time / group.n_time
+    length = time[np.flatnonzero(group.window).max()] / PARTS
+    # No cut where the record itself begins or ends.
+    begins, ends = part * length if part else -np.inf, (part + 1) * length if part < PARTS - 1 else np.inf
+    depth = np.minimum(time - begins, ends - time)
+    fade = np.clip((depth if inside else -depth) / CROSSING, 0.0, 1.0)
+    return replace(group, window=group.window * np.sin(0.5 * np.pi * fade) ** 2)
+
+
+def _left_with(model: pin.Model, indices: Sequence[int], given: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> np.ndarray:
+    """(n,) squares left of ``other`` by bodies of a model with drives fitted to ``given``, both as of ``_rows``."""
+    bodies = np.concatenate([model.inertias[i].toDynamicParameters() for i in indices])
+
+    def at(rows: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        y, Y, a, v, friction = rows
+        return y - Y @ bodies, np.concatenate([a[..., None], v[..., None], friction], axis=-1)
+
+    (y, X), (y_other, X_other) = at(given), at(other)
+    drives = np.stack([np.linalg.lstsq(X[:, j], y[:, j], rcond=None)[0] for j in range(y.shape[1])])
+    return np.sum((y_other - np.einsum("rjc,jc->rj", X_other, drives)) ** 2, axis=0)
 
 
 def _rows(

@@ -16,7 +16,7 @@ from ident.graybox import LinkChange, Parameters, build_structure
 from ident.hypotheses import catalogue
 from ident.hypotheses.sensing import torque_offset
 from ident.recursion import chain_of
-from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, fit_rigid, regressor
+from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, carried_over, fit_rigid, regressor
 from ident.screening import wave_numbers
 from ident.torque_fit import fit, predictions
 from ident.trust import too_fast
@@ -117,6 +117,23 @@ def test_links_that_are_not_as_described_are_found(moved, ur10):
     true, fitted, described = (x + p * a for x, p in ((true, problem.nominal.inertia), (fitted, found.par.inertia), (described, problem.nominal.inertia)))
     error, gap = (np.sqrt(np.mean((x - true) ** 2, axis=0)) for x in (fitted, described))
     assert np.all(error[1:] < 0.1 * gap[1:])
+
+
+def test_inertias_that_foretell_what_was_left_out_are_told_from_those_that_only_fit(moved, ur10):
+    """Bodies as they are not, and as they are, along motions of 20 s; and torque that has another cause along 4 s."""
+
+    def ratio(structure, problem, groups):
+        return carried_over(structure, problem.nominal, groups)
+
+    problem = set_up(moved).problem
+    assert ratio(problem.structure, problem, problem.groups) < 0.1
+    true = build_structure(ur10, links=CHANGED)
+    assert ratio(true, problem, problem.groups[:1]) > 0.9
+    t, q, tau = (x[:1000] for x in rigid_motion(ur10, 5))
+    ripple = 3.0 * np.sin(40.0 * q + np.arange(6))
+    short = dataset_of(ur10, Segment(name="m", role="identification", kind="trajectory", t=t, tau=tau + ripple, q=q))
+    problem = set_up(short).problem
+    assert ratio(true, problem, problem.groups) > 0.9
 
 
 def test_a_hinge_across_a_joint_keeps_the_inertia_that_was_found(ur10):

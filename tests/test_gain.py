@@ -1,0 +1,70 @@
+"""Intervals of the gain: how often they hold what they are for."""
+
+import numpy as np
+import pytest
+
+from ident.gain import Errors, line_squares, mean_squares, measure_gain
+
+LINES, DRAWS = 120, 150
+NOISE = 0.02
+
+
+def complex_normal(rng, shape):
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2.0)
+
+
+def resonance(lines, quality):
+    x = lines / 40.0
+    return 1.0 / np.abs(1.0 - x**2 + 1j * x / quality)
+
+
+def gains(of_excitation, at_random, rng):
+    """Closed shares and intervals of single records of random phase, and the share that many of them have.
+
+    Args:
+        of_excitation, at_random: each (before, after), (K,) errors of a linear model and of stochastic nonlinear distortion.
+    """
+    excited = np.arange(LINES) % 4 == 1
+
+    def squares(n):
+        X = excited * np.exp(2j * np.pi * rng.random((n, LINES)))
+        common = complex_normal(rng, X.shape)
+        draws = (common, 0.5 * common + np.sqrt(0.75) * complex_normal(rng, X.shape))
+        return [np.abs(g * X + s * c + NOISE * complex_normal(rng, X.shape)) ** 2 for g, s, c in zip(of_excitation, at_random, draws)]
+
+    noise = np.full((LINES, 1), NOISE**2)
+    floor = np.sqrt(mean_squares(noise[None])[0, 0])
+    before, after = (np.sqrt(mean_squares(x[..., None]).mean()) for x in squares(5000))
+    out = []
+    for b, a in zip(*squares(DRAWS)):
+        rows = Errors(("one",) * LINES, *(line_squares(x.reshape(-1, 1)) for x in (b, a, noise)))
+        out.append(measure_gain(rows, ("drive",), [0], "validation segments", rng))
+    return out, (before - after) / (before - floor)
+
+
+FLAT = np.ones(LINES)
+PEAK = resonance(np.arange(LINES), 8.0)
+
+
+@pytest.mark.parametrize(
+    ("of_excitation", "at_random", "widest"),
+    [
+        ((FLAT, 0.3 * FLAT), (0.0, 0.0), 1.5),
+        ((FLAT, 0.1 * FLAT), (0.3, 0.2), 1.8),
+        ((PEAK, 0.1 * PEAK), (0.3 * PEAK, 0.2 * PEAK), 2.0),
+        ((0.0, 0.0), (FLAT, 0.3 * FLAT), 1.3),
+        ((0.0, 0.0), (PEAK, 0.3 * PEAK), 1.3),
+    ],
+    ids=["linear", "both", "both, resonant", "stochastic", "stochastic, resonant"],
+)
+def test_the_interval_of_a_single_periodic_record_covers_what_other_phases_show(of_excitation, at_random, widest):
+    found, true = gains(of_excitation, at_random, np.random.default_rng(3))
+    low, high = np.array([g.ci95 for g in found]).T
+    assert np.mean((low <= true) & (true <= high)) > 0.9
+    scatter = np.std([g.gap_closed for g in found])
+    assert 0.85 < np.mean(high - low) / (3.92 * scatter) < widest
+
+
+def test_lines_of_a_record_make_up_its_mean_square():
+    lines = np.random.default_rng(0).random((30, 2))
+    assert line_squares(lines).mean(axis=0) == pytest.approx(mean_squares(lines[None])[0])
