@@ -219,6 +219,8 @@ def build_structure(
     known = inertias or {}
     placed = _placed_loads(robot, source)
     carrier = {0: _add_hinges(model, 0, [h for h in hinges if h.joint == "base"], pin.SE3.Identity())[0]}
+    if carrier[0]:  # on a foundation that moves the root link moves with it
+        model.appendBodyToJoint(carrier[0], source.inertias[0], pin.SE3.Identity())
     index: dict[str, int] = {}
     for i in range(1, source.njoints):
         name, joint = source.names[i], source.joints[i]
