@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.attribute import Attribution, attribute
-from ident.baseline import fit_baseline
+from ident.baseline import DETECTION_EXCESS, fit_baseline
 from ident.channel_checks import MOVES
 from ident.conclude import conclude, named_effects
 from ident.dataset import Dataset
@@ -28,14 +28,14 @@ from ident.hypotheses.sensing import torque_offset
 from ident.inverse import Sampling
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.next_experiment import separating_experiment
-from ident.noise import sample_noise
+from ident.noise import sample_noise, unexcited_noise
 from ident.parallel import Workers, one_thread_each
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, carried_over, fit_rigid
 from ident.torque_checks import mislabelled
-from ident.torque_fit import NOT_COMPUTED, Fit, Problem, data_count, fit, predictions
+from ident.torque_fit import NOT_COMPUTED, Fit, Problem, data_count, fit, output_error, predictions
 from ident.trust import LEFT_ERROR, denied, known_probability
 from ident.units import torque_unit
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
@@ -173,11 +173,28 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     setup = set_up(dataset)
     try:
         result = fit_baseline(setup.problem, progress)
+        louder = with_noise_of_unexcited_lines(dataset, setup.problem, result)
+        if louder is not setup.problem:
+            setup = replace(setup, problem=louder)
+            result = fit_baseline(louder, progress)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
         raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
     problem = replace(with_measured_noise(setup.problem, result), scatter_share=result.share)
     return replace(setup, problem=problem), result
+
+
+def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
+    """Sample noise that was guessed, raised to what lines show that nothing excites, where periods show no scatter."""
+    guessed = [not (given is not None and np.all(given > 0)) for given in (dataset.q_std, dataset.tau_std)]
+    single = all(g.window is None and g.U_periods.shape[1] == 1 for g in problem.groups)
+    if not single or not any(guessed) or result.chi2_per_dof <= DETECTION_EXCESS:
+        return problem
+    found = predictions(problem, result.model, result.remainders)
+    residuals = [output_error(g, p) for g, p in zip(problem.groups, found, strict=True)]
+    factor = np.sqrt(unexcited_noise(problem.groups, [result.weights.apply(i, x) for i, x in enumerate(residuals)]))
+    q_std, tau_std = (std * factor if unknown else std for std, unknown in zip((problem.q_std, problem.tau_std), guessed, strict=True))
+    return replace(problem, q_std=q_std, tau_std=tau_std) if factor > 1.0 else problem
 
 
 def with_measured_noise(problem: Problem, result: Fit) -> Problem:

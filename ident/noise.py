@@ -17,6 +17,7 @@ from ident.records import Group, mean_over_lines
 
 PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
+FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 BAND_LINES = 20  # of a band in which the coherence of neighbouring lines is taken
 TOGETHER, NO_CHANCE = 0.8, 5.0  # coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
 
@@ -117,6 +118,29 @@ def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean over lines k-half..k+half, and how many lines entered."""
     k = np.arange(len(x))
     return mean_over_lines(x, half), np.minimum(k + half + 1, len(x)) - np.maximum(k - half, 0)
+
+
+def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> float:
+    """Power of what a model leaves at the lines that nothing excites, over that of the noise it was whitened with; 1 where it is less.
+
+    Noise that is neither given nor seen to scatter between periods is guessed from differences of samples, as white: where it is
+    coloured more is left, at excited lines and at the others alike. What a model lacks shows at those excited first: where
+    these hold ``FLAT`` times as much as the others nothing is said about noise, and 1 returned.
+
+    Args:
+        whitened: (S, K, n) residual by group, real and imaginary parts of unit variance.
+    """
+    power, count = np.zeros(2), np.zeros(2)
+    for group, Z in zip(groups, whitened, strict=True):
+        excited = group.excited[:, 1 : Z.shape[1]]
+        squares = np.sum(np.abs(Z[:, 1:]) ** 2, axis=2)
+        for i, lines in enumerate((excited, ~excited)):
+            power[i] += np.sum(squares[lines])
+            count[i] += 2 * Z.shape[2] * np.sum(lines)
+    if np.any(count == 0):
+        return 1.0
+    at_excited, at_others = power / count
+    return float(max(at_others, 1.0)) if at_excited < FLAT * at_others else 1.0
 
 
 def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -117,6 +117,26 @@ def test_nothing_faint_is_sought_where_the_noise_is_not_measured(identified, hyp
         assert faint_scores(replace(problem, groups=(other, *problem.groups[1:])), baseline, hypotheses, none) == []
 
 
+def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside_it_is(ur10, tmp_path):
+    """Noise that is neither given nor repeated is guessed as white, from differences of samples that hardly show coloured noise."""
+    hidden = parse_effect("payload@flange:mass=0.5,com_x=0.02,com_y=0.03,com_z=0.08", ur10)
+
+    def recorded(effects, folder):
+        data = run_experiment(small_plan(ur10, 5, levels=(1.0,), periods=2, validation_points=0), effects, seed=5, noise=0.0)
+        rng = np.random.default_rng(7)
+
+        def coloured(x, std):
+            return x + lfilter([np.sqrt(1 - 0.6**2)], [1.0, -0.6], std * rng.normal(size=(500 + len(x), len(std))), axis=0)[500:]
+
+        segments = (replace(s, q=coloured(s.q, ur10.array("q_std")), tau=coloured(s.tau, ur10.array("tau_std"))) for s in data.segments)
+        return through_files(replace(data, segments=tuple(segments), q_std=None, tau_std=None), folder)
+
+    verdict = diagnose(recorded([], tmp_path / "none"), max_causes=1)
+    assert not verdict.discrepancy.detected and verdict.causes == ()
+    cause, *others = diagnose(recorded([hidden], tmp_path / "load"), max_causes=1).causes
+    assert (cause.effect, others) == ("payload", []) and cause.parameters["mass"].value == pytest.approx(0.5, rel=0.02)
+
+
 def test_lines_go_together_where_noise_drifts_and_nowhere_else():
     """White, coloured, walking and drifting noise in records of 3 periods, cut without a window."""
     rng, S, P, N, alpha = np.random.default_rng(4), 6, 3, 900, 0.8
