@@ -308,7 +308,8 @@ def linearise(structure: Structure, q: np.ndarray) -> Linearisation:
     """Inertia, gravity and gravity slope of the link side at ``q`` (N,), at rest."""
     model, data = structure.model, structure.model.createData()
     M = pin.crba(model, data, q)
-    M = np.triu(M) + np.triu(M, 1).T
+    k = np.arange(len(M))
+    M = np.where(k[:, None] <= k, M, M.T)
     slope = np.array(pin.computeGeneralizedGravityDerivatives(model, data, q))
     return Linearisation(q, M, slope, np.array(pin.computeGeneralizedGravity(model, data, q)))
 

@@ -67,7 +67,13 @@ def yielded(k: float, limit: float, n: float, recoil: float, h: float, dx: float
     By exponential steps, the law being linearised where each begins (Rosenbrock-Euler): of second order, stable for any
     ``dx``, and exact for Dahl's bristle.
     """
-    return _yielded(k, limit, n, recoil, (abs(h) / limit) ** n, h, dx)
+    return _yielded(k, limit, n, recoil, _power(h, limit, n), h, dx)
+
+
+@njit(cache=True, nogil=True)
+def _power(h: float, limit: float, n: float) -> float:
+    """``w^n``; nothing of a Maxwell slip, which does not ask for it."""
+    return 0.0 if n >= SLIP else (abs(h) / limit) ** n
 
 
 @njit(cache=True, nogil=True)
@@ -114,7 +120,7 @@ def yielding_point(
     """
     low, high = free - direct * limit, free + direct * limit
     dx = min(max(near, low), high)
-    torque, power = h, (abs(h) / limit) ** n
+    torque, power = h, _power(h, limit, n)
     for _ in range(60):
         torque, slope = _yielded(k, limit, n, recoil, power, h, dx)
         miss = dx + direct * torque - free
