@@ -90,7 +90,7 @@ MACHINES = (
         ("exciting_traj_positions.txt", "exciting_traj_time.txt", "exciting_traj_torques.txt", "exciting_traj_velocity.txt"),
         "Franka Panda, joint torque sensors",
         "Gaz, Cognetti, Oliva, Robuffo Giordano and De Luca, IEEE RA-L 2019 (GPL-3.0, not shipped). Their model, version 1.0, was evaluated"
-        " with their own program along this run; it knows no offsets of the sensors, and is told as it is and with those of the first"
+        " from their published expressions along this run (its torques are not part of this project); it knows no offsets of the sensors, and is told as it is and with those of the first"
         " half of the run. They fitted it to recordings of their own, which may hold this one, held-out half and all. Friction on the"
         " side of the sensor, with loops before it slips.",
         1,

@@ -17,6 +17,7 @@ from ident.channel_checks import (
     unit_warnings,
 )
 from ident.dataset import CHANNELS, Dataset, Segment
+from ident.parallel import one_thread_each
 from ident.records import difference_noise
 from ident.skew_checks import skew_warnings
 from ident.torque_checks import torque_warnings
@@ -87,6 +88,7 @@ class Report:
         return "\n".join([*rows, *(f"warning: {w}" for w in self.warnings)])
 
 
+@one_thread_each
 def inspect_dataset(dataset: Dataset) -> Report:
     """Contents, noise from fourth differences, and warnings."""
     segments = dataset.segments
