@@ -230,7 +230,7 @@ def section(found: Outcome) -> str:
     for trace in result.traces[: int(machine.picture)]:
         picture = PAGE.parent / f"{machine.folder}.svg"
         # The figures of the report take their colours from its page.
-        svg = trace_figure(trace, result.joints, torque_units(result.robot)).replace('version="1.1">', f'version="1.1">{COLOURS}', 1)
+        svg = trace_figure(trace, result.joints, torque_units(result.robot), result.verdict.gain.joints).replace('version="1.1">', f'version="1.1">{COLOURS}', 1)
         picture.write_text(svg, encoding="utf-8")
         lines += [f"![Error of the torque on held-out motion, before and after]({picture.name})", ""]
     lines += [f"{found.seconds:.0f} s with `--max-causes {machine.max_causes}`.", ""]

@@ -15,7 +15,7 @@ from ident.excitation import make_plan, plan_from_toml
 from ident.graybox import Parameters, build_structure, equilibrium, linearise, parameter_names
 from ident.hypotheses.structure import Change, apply_change
 from ident.show.export import build_mjcf
-from ident.show.figures import rounded
+from ident.show.figures import rounded, trace_figure
 from ident.show.outputs import write_outputs
 from ident.verdict import (
     Cause,
@@ -249,6 +249,16 @@ def test_the_next_plan_is_written_and_an_old_one_taken_away(diagnosis, ur10, tmp
     assert np.allclose(again.experiments[3].r, plan.experiments[3].r, atol=1e-9)
     write_outputs(diagnosis, tmp_path / "out")
     assert not (tmp_path / "out" / "next_plan.toml").exists()
+
+
+def test_torques_are_shown_at_the_joints_of_the_gain_first():
+    """The other places go to the joints where the baseline errs most, relative to their torque."""
+    joints = tuple("abcdef")
+    measured = np.tile(np.sin(np.arange(50.0))[:, None], 6)
+    errors = np.array([0.01, 0.5, 0.02, 0.4, 0.3, 0.03]) * measured
+    trace = TorqueTrace("s", np.arange(50.0), measured, measured - errors, measured, measured)
+    shown = [[j for j in joints if f"<!-- {j} -->" in trace_figure(trace, joints, ("N m",) * 6, of)] for of in ((), ("c",), tuple("acf"))]
+    assert shown == [list("bde"), list("bcd"), list("acf")]
 
 
 def test_figures_leave_the_callers_matplotlib_alone():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Collection
 from itertools import pairwise
 
 import matplotlib as mpl
@@ -197,11 +198,14 @@ def evidence_figure(plot: EvidencePlot) -> str:
         return _svg(fig)
 
 
-def trace_figure(trace: TorqueTrace, joints: tuple[str, ...], units: tuple[str, ...]) -> str:
-    """Torque errors of both models in time on one held-out segment, worst three joints."""
+def trace_figure(
+    trace: TorqueTrace, joints: tuple[str, ...], units: tuple[str, ...], of_gain: Collection[str] = ()
+) -> str:
+    """Torque errors of both models in time on one held-out segment, of three joints: those ``of_gain`` first, then the worst."""
     before = (trace.measured - trace.before).std(axis=0)
     scale = np.maximum(trace.measured.std(axis=0), 1e-9)
-    worst = np.sort(np.argsort(-before / scale)[: min(3, len(joints))])
+    others = np.array([name not in of_gain for name in joints])
+    worst = np.sort(np.lexsort((-before / scale, others))[: min(3, len(joints))])
     with mpl.rc_context(STYLE):
         fig, axes = _subplots(len(worst), 1, figsize=(11, 1.4 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained")
         step = max(1, len(trace.t) // POINTS)

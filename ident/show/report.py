@@ -29,7 +29,8 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=select_autoescape(["j2", "html"])
     )
-    joints, robot = diagnosis.joints, diagnosis.robot
+    joints, robot, gain = diagnosis.joints, diagnosis.robot, diagnosis.verdict.gain
+    of_gain = gain.joints if gain else ()
     html = environment.get_template("report.html.j2").render(
         d=diagnosis,
         v=diagnosis.verdict,
@@ -45,7 +46,7 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         frfs=[(view.operating_point, frf_figure(view, joints, response_unit(robot))) for view in diagnosis.frf[:MAX_FRFS]],
         where=where_figure(diagnosis.spectrum, joints, torque_unit(robot)) if diagnosis.spectrum else None,
         evidence={p.cause: evidence_figure(p) for p in diagnosis.evidence},
-        traces=[(t.segment, trace_figure(t, joints, torque_units(robot))) for t in diagnosis.traces[:MAX_TRACES]],
+        traces=[(t.segment, trace_figure(t, joints, torque_units(robot), of_gain)) for t in diagnosis.traces[:MAX_TRACES]],
     )
     path.write_text(html, encoding="utf-8")
 
