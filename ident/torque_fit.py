@@ -646,8 +646,8 @@ def fit(
     converged = False
     exact = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
     fine = False  # whether the steps are by exact derivatives already
-    # Columns beside loops take most of the time: each is a periodic motion of its own. So do those of other bodies: an arm each.
-    slow = any(has_loop(e) or e.hypothesis.channel == "model" for e in model.effects)
+    # Columns beside loops take most of the time: each is a periodic motion of its own.
+    slow = any(has_loop(e) for e in model.effects)
     columns: list[Columns] = []
     for _ in range(iterations):
         fresh = not columns
