@@ -128,7 +128,7 @@ def conclude(
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
             *faint_note(result),
-            *drift_note(problem),
+            *(() if named_effects(final) else drift_note(problem)),
             *(belied_note(e) for e in named_effects(final) if e.hypothesis.key in belied),
             *(nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy),
             *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
