@@ -88,8 +88,7 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
             break
     if unexplained[-1] > (1.0 - EXPLAINED) * np.sum((y - y.mean(axis=0)).ravel()[rows] ** 2):
         return UNKNOWN
-    parts = np.array([_shift(A[rows][block != k], slope[block != k], y.ravel()[rows][block != k]) for k in range(BLOCKS)])
-    skew = Skew(float(late), float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2))))
+    skew = Skew(float(late), _spread(A[rows], slope, y.ravel()[rows], block))
     noise = float(np.sum(keep * (difference_noise(s.tau) / scale) ** 2)) * _passed(rate)
     if skew.sure and unexplained[-1] > max((1.0 - GONE) * unexplained[0], NOTHING * noise):
         return UNKNOWN
@@ -126,6 +125,12 @@ def _shift(A: np.ndarray, slope: np.ndarray, y: np.ndarray) -> float:
     return float(own @ (y - U @ (U.T @ y)) / max(own @ own, 1e-300))
 
 
+def _spread(A: np.ndarray, slope: np.ndarray, y: np.ndarray, block: np.ndarray) -> float:
+    """Standard deviation of ``_shift`` by the jackknife over the ``BLOCKS`` that rows are of (Efron 1982)."""
+    parts = np.array([_shift(A[block != k], slope[block != k], y[block != k]) for k in range(BLOCKS)])
+    return float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2)))
+
+
 def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
     """How late the link encoder of each joint comes after its motor encoder, s.
 
@@ -142,10 +147,10 @@ def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
         full[k][:, structure.driven] = x
     carried = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(q))])[:, structure.driven]
     for j in range(dataset.n):
-        link = None if s.q_link is None else s.q_link[:, j]
+        link = s.q_link[:, j]
         keep = np.abs(v[:, j]) > MOVING * np.abs(v[:, j]).max()
         keep[:edge] = keep[len(keep) - edge :] = False
-        if link is None or not np.all(np.isfinite(link)) or np.ptp(link) == 0 or keep.sum() < 10 * BLOCKS:
+        if not np.all(np.isfinite(link)) or np.ptp(link) == 0 or keep.sum() < 10 * BLOCKS:
             out.append(UNKNOWN)
             continue
         y = _low(s.q[:, [j]] - link[:, None], rate)[keep, 0]
@@ -153,8 +158,7 @@ def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
         A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         slope = v[keep, j]
         block = np.arange(len(y)) * BLOCKS // len(y)
-        parts = np.array([_shift(A[block != k], slope[block != k], y[block != k]) for k in range(BLOCKS)])
-        out.append(Skew(_shift(A, slope, y), float(np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean()) ** 2)))))
+        out.append(Skew(_shift(A, slope, y), _spread(A, slope, y, block)))
     return out
 
 

@@ -8,7 +8,7 @@ import pytest
 from ident import inverse
 from ident.diagnosis import set_up
 from ident.extended import Model, predict
-from ident.inverse import REMAINDER_STEPS, geometric_remainder, make_plane, solve, true_position
+from ident.inverse import REMAINDER_STEPS, STALL_STEPS, geometric_remainder, make_plane, solve, true_position
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from tests.conftest import small_plan, through_files
@@ -37,3 +37,18 @@ def test_a_single_axis_without_a_remainder_takes_one_step(tmp_path, monkeypatch)
     monkeypatch.setattr(inverse, "geometric_remainder", lambda *args: asked.append(1) or plain(*args))
     predict(Model(problem.structure, problem.nominal), problem.groups[0], problem.sampling)
     assert len(asked) == 1
+
+
+def test_links_whose_motion_does_not_repeat_are_given_up(clean, monkeypatch):
+    """As of a gear that hits one end of its dead band after the other: every look at it shows another motion."""
+    problem = set_up(clean[0]).problem
+    asked, rng, plain = [], np.random.default_rng(2), inverse.geometric_remainder
+
+    def unsettled(*args):
+        asked.append(1)
+        out = plain(*args)
+        return out + np.abs(out).max() * rng.normal(size=out.shape)
+
+    monkeypatch.setattr(inverse, "geometric_remainder", unsettled)
+    predict(Model(problem.structure, problem.nominal), problem.groups[0], problem.sampling)
+    assert 2 * STALL_STEPS <= len(asked) < REMAINDER_STEPS
