@@ -71,6 +71,7 @@ LINEAR_SHARE = 0.5 * MIN_SHARE  # of what is left at a joint, from which a frict
 LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record or found so far, from which its loop is begun
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
+LAWS_LEAVE = 1e-4  # of what causes explain at a joint, left there by errors of a hundredth in their laws: no other is sought loudly
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
 
@@ -143,10 +144,11 @@ def attribute(
         if settled(current) and looped is not current:
             # Along the record noise is taken large, and hides other causes.
             current = looped = as_loops(problem, current, workers)
-        asked, faint = hypotheses, not loud or settled(current)
+        told = baseline.costs - current.costs
+        asked, faint = hypotheses, not loud or settled(current) or settled(less_errors_of_laws(current, told))
         if faint:
             workers.say("what the noise as a whole would hide")
-            asked, by_chance = hidden(problem, current, hypotheses, baseline.costs - current.costs)
+            asked, by_chance = hidden(problem, current, hypotheses, told)
             if not asked:
                 break
             p_detected = p_detected if loud or rounds else by_chance
@@ -193,6 +195,18 @@ def attribute(
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
     return Attribution(baseline, loud or bool(kept), p_detected if kept else p_value, kept, current, unknown)
+
+
+def less_errors_of_laws(current: Fit, told: np.ndarray) -> Fit:
+    """A fit as if it left no more than noise at joints where that may be errors of the laws of causes there.
+
+    Args:
+        told: (n,) fall of the cost by joint that causes have brought.
+    """
+    own = [e.hypothesis.joint for e in current.model.effects if not e.hypothesis.on_chain]
+    laws = np.zeros(len(told))
+    laws[own] = LAWS_LEAVE * np.maximum(told[own], 0.0)
+    return replace(current, costs=np.where(current.costs - current.counts < laws, np.minimum(current.costs, current.counts), current.costs))
 
 
 def told_share(baseline: Fit, found: Round) -> float:
@@ -520,10 +534,10 @@ def attribute_once(
 
     Args:
         least, bare: as of ``search.explore``, from the model as it is.
-        quiet: joints at which no strong effect is sought.
+        quiet: joints at which no strong effect is sought, and what is left asks for no hinge.
     """
     before, softly = current, {}
-    found, scores = explore(problem, current, hypotheses, least, bare, workers)
+    found, scores = explore(problem, current, hypotheses, least, bare, workers, quiet=quiet)
     excess = max(current.cost - current.count, 1.0)
     told = bool(found) and settles_its_joint(problem, current, *found[0])
     if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not told and not workers.late:

@@ -20,7 +20,7 @@ TEMPER_OF_NOISE = 1.5  # the same where the model without any of them leaves noi
 MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
 STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
 LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave
-POINTLESS_NATS = 5.0  # against an effect whose essential parameter is found absent
+POINTLESS_NATS = 5.0  # against an effect whose essential parameters are found absent
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 WAVE = "sine", "cosine"  # amplitudes of an effect that repeats along its variable
 RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
@@ -135,9 +135,10 @@ def occam(candidate: Candidate, temper: float) -> float:
     keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
     count = int(np.sum(~absent))
     options = effect.hypothesis.options
-    essential = any(a and q.name == options.get("essential") for q, a in zip(ps, absent, strict=True))
+    essential = options.get("essential", ())
+    nothing = bool(essential) and set(essential) <= {q.name for q, a in zip(ps, absent, strict=True) if a}
     stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
-    nats = POINTLESS_NATS * (essential or pointless(effect, stiffness))
+    nats = POINTLESS_NATS * (nothing or pointless(effect, stiffness))
     if count == 0:
         return -nats
     own = np.linalg.inv(inverse(H[np.ix_(keep, keep)], STEADY)[-count:, -count:])

@@ -212,6 +212,7 @@ def explore(
     workers: Workers,
     *,
     rough: bool = False,
+    quiet: frozenset[int] = frozenset(),
 ) -> tuple[list[tuple[Hypothesis, Fit]], list[Score]]:
     """Candidates fitted under the weights of ``stage``, best first, and all scores.
 
@@ -219,6 +220,7 @@ def explore(
         least: share of the excess over noise that a linear step must explain for any to be refitted.
         bare: share of it that the best may leave after the first steps, beyond which hinges are tried everywhere.
         rough: the first steps are enough where they answer: the candidates are fitted again.
+        quiet: joints at which what is left asks for no hinge.
     """
     preds = predictions(problem, stage.model, stage.remainders)
     scores = screen(problem, stage, preds, hypotheses)
@@ -246,7 +248,9 @@ def explore(
         found += begun(other_bodies(found, chosen, scores))
     # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law along the
     # record, or under which a record may be in another steady motion, leaves that much itself.
-    unclear = stage.chi2_per_dof <= FAINT and not has_rough_law(stage.model) and left_by(found) > (DETECTION_EXCESS - 1.0) * stage.count
+    seen = np.setdiff1d(np.arange(len(stage.counts)), list(quiet))
+    allowed = (DETECTION_EXCESS - 1.0) * np.sum(stage.counts[seen])
+    unclear = stage.chi2_per_dof <= FAINT and not has_rough_law(stage.model) and left_by(found, seen) > allowed
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
@@ -278,9 +282,9 @@ def begin(problem: Problem, stage: Fit, score: Score) -> tuple[Model, float]:
     return models[best], costs[best]
 
 
-def left_by(found: Sequence[tuple[Hypothesis, Fit]]) -> float:
-    """Excess of the cost over noise that the best candidate leaves; infinite where there is none."""
-    return min((r.cost - r.count for _, r in found), default=np.inf)
+def left_by(found: Sequence[tuple[Hypothesis, Fit]], joints: np.ndarray | slice = slice(None)) -> float:
+    """Excess of the cost over noise that the best candidate leaves, at some ``joints`` or all; infinite where there is none."""
+    return min((float(np.sum((r.costs - r.counts)[joints])) for _, r in found), default=np.inf)
 
 
 def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:

@@ -254,7 +254,7 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
         " of {time_constant:.0f} s.",
         variable="time",
-        options={"absorbs": "coulomb_friction", "absorb": absorb, "essential": "relative_change", "dry": True},
+        options={"absorbs": "coulomb_friction", "absorb": absorb, "essential": ("relative_change",), "dry": True},
     )
 
 
@@ -332,8 +332,8 @@ def position_friction(joint: int, place: str) -> Hypothesis:
         "motor",
         (
             Parameter("constant", "N m", -1e7, 1e7),
-            Parameter("slope", "N m/rad", -1e9, 1e9),
-            Parameter("curvature", "N m/rad2", -1e9, 1e9),
+            Parameter("slope", "N m/rad", -1e9, 1e9, null=0.0),
+            Parameter("curvature", "N m/rad2", -1e9, 1e9, null=0.0),
             SMOOTHING,
         ),
         law,
@@ -343,6 +343,7 @@ def position_friction(joint: int, place: str) -> Hypothesis:
         options={
             "absorbs": "coulomb_friction",
             "absorb": lambda p, weights, old: np.array([old[0] + weights[0], weights[1], weights[2], old[2]]),
+            "essential": ("slope", "curvature"),
             "dry": True,
         },
     )
