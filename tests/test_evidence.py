@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ident.attribute import (
+    LAWS_LEAVE,
     LEFT_TO_DECOYS,
     Attribution,
     Round,
@@ -14,6 +15,7 @@ from ident.attribute import (
     companions,
     leaves_much,
     left_share,
+    less_errors_of_laws,
     outdone,
     pruned,
     settled,
@@ -120,6 +122,15 @@ def test_an_absent_parameter_costs_nothing_unless_it_makes_the_effect(named):
     without = -0.5 * np.log(1.0 + LOG_SPREAD**2 * 1e4 / TEMPER)
     assert absent == pytest.approx(without - POINTLESS_NATS - 0.5 * (near / 0.5) ** 2, abs=1e-3)
     assert present > absent - POINTLESS_NATS
+
+
+@pytest.mark.parametrize(("slope", "curvature", "absent"), [(0.0, 0.0, True), (1.0, 0.0, False), (0.0, 1.0, False)])
+def test_a_friction_of_any_posture_that_is_of_none_is_no_rival(named, slope, curvature, absent):
+    """Without slope and curvature it is Coulomb's, and fits as well."""
+    h = named["unknown:position_friction", "elbow_joint"]
+    known = candidate(h, [3.0, slope, curvature, 1e-3], [0.0, 1e4, 1e4, 0.0])
+    seen = -0.5 * np.log(1.0 + 1e4 / TEMPER)  # of one whose spread before the data is its own size
+    assert occam(known, TEMPER) == pytest.approx(-POINTLESS_NATS if absent else seen, abs=1e-3)
 
 
 def test_parameters_that_are_known_together_alone_are_not_absent(named):
@@ -584,6 +595,33 @@ def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identi
     assert joints(4, set()) == {2, 4} and joints(4, {2}) == {1, 4} and joints(2, {2}) == {1}
     assert joints(4, {1, 2}) == {4}  # what the others have is what the errors at the quiet joint leave there
     assert joints(4, set(range(6))) == set()
+
+
+@pytest.mark.parametrize(("left", "loudly"), [(0.5 * LAWS_LEAVE, False), (2.0 * LAWS_LEAVE, True)])
+@pytest.mark.parametrize("own", [True, False])
+def test_errors_of_a_law_are_not_searched_as_a_whole(identified, named, left, loudly, own):
+    """Those of a ten-thousandth at the joint of the cause; as much at another one may be a cause of its own."""
+    result = identified[-1]
+    j, count = 2, result.counts
+    at = np.eye(6)[j if own else 3] * 1e4 * np.sum(count)
+    told = 1e4 * np.sum(count) * np.eye(6)[j]
+    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([3.0, 0.0, 1e-3]))
+    current = replace(result, model=replace(result.model, effects=(rub,)), costs=count + left * at)
+    assert not settled(current)
+    assert settled(less_errors_of_laws(current, told)) == (own and not loudly)
+    quieter = replace(current, costs=0.9 * count)
+    assert less_errors_of_laws(quieter, told).costs == pytest.approx(quieter.costs)
+
+
+def test_what_a_law_leaves_at_its_joint_asks_for_no_hinge(identified, named, monkeypatch):
+    _, setup, result = identified
+    count, told = result.counts, []
+    stage = replace(result, costs=count * np.array([1.0, 1.0, 2.5, 1.0, 1.0, 1.0]))
+    monkeypatch.setattr("ident.search.refit", lambda *args: replace(stage, converged=True))
+    monkeypatch.setattr("ident.search.hinges_everywhere", lambda *args: told.append(args) or [])
+    for quiet, asked in (((), 1), ((2,), 1), ((3,), 2)):  # how often so far
+        explore(setup.problem, stage, [named["unknown:drag_2", "elbow_joint"]], 0.0, np.inf, Workers(), quiet=frozenset(quiet))
+        assert len(told) == asked
 
 
 def test_a_search_seeks_no_strong_effect_at_quiet_joints(identified, monkeypatch):
