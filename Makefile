@@ -17,9 +17,10 @@ $(STAMP): requirements.lock pyproject.toml
 demo: $(STAMP)
 	$(BIN)/simgap demo --out out/demo --seed 7
 
-# A process a core: linear algebra on two threads in each would only wait for each other.
+# A process a core: threads in each would only wait for each other.
 test test-all: export OMP_NUM_THREADS = 1
 test test-all: export OPENBLAS_NUM_THREADS = 1
+test test-all: export SIMGAP_THREADS = 1
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -m "not slow" -n 2

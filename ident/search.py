@@ -63,13 +63,15 @@ WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: l
 
 
 def revived(problem: Problem, model: Model) -> Model:
-    """A model whose collapsed dampers and viscous friction are back at a size that a fit can move.
+    """A model whose collapsed dampers and viscous friction are back at a size that a fit can move, and hinges free to turn on.
 
-    What a missing cause has driven towards nothing has no slope left in logarithmic coordinates.
+    What a missing cause has driven towards nothing has no slope left in logarithmic coordinates; a hinge that has turned far from the
+    axis from which it was sought is sought from a nearer one.
     """
     par, least = model.par, problem.nominal
     return replace(
         model,
+        effects=tuple(turned(e) for e in model.effects),
         par=replace(
             par,
             damping=np.maximum(par.damping, REVIVED * least.damping),
@@ -77,6 +79,12 @@ def revived(problem: Problem, model: Model) -> Model:
             elastic_damping=np.maximum(par.elastic_damping, REVIVED * least.elastic_damping),
         ),
     )
+
+
+def turned(effect: Effect) -> Effect:
+    """A hinge sought from the axis that is nearest to its own; any other effect as it is."""
+    found = effect.hypothesis.options.get("nearer", lambda p: None)(effect.p)
+    return effect if found is None else Effect(*found)
 
 
 def polish(problem: Problem, result: Fit) -> Fit:

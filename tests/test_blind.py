@@ -25,7 +25,7 @@ def hide(robot, name, seed, folder):
     rng = np.random.default_rng(seed)
     effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH.get(name, 2.0))
     data = run_experiment(
-        small_plan(robot, seed), [effect], seed=seed, drives=draw_drives(rng, robot)
+        small_plan(robot, seed), [effect], seed=seed, drives=draw_drives(rng, robot), timestep=5e-4
     )
     return effect, through_files(data, folder)
 

@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ident.attribute import (
     LAWS_LEAVE,
@@ -62,6 +64,7 @@ from ident.search import (
     refit,
     reweighted,
     strong_effects,
+    turned,
     under_own_noise,
 )
 from ident.torque_fit import (
@@ -374,6 +377,32 @@ def test_a_hinge_far_above_the_band_is_screened_where_it_is(identified):
     first, second, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), hinges)
     assert first.hypothesis is base and first.gain > 1.2 * second.gain
     assert first.start[0] == pytest.approx(stiffness, rel=0.3)
+
+
+@settings(deadline=None, max_examples=30)
+@given(tilts=st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=2))
+@pytest.mark.parametrize("place", ["elbow_joint", "base"])
+def test_a_hinge_is_the_same_from_the_nearest_axis(named, place, tilts):
+    h = named["base_elasticity" if place == "base" else "transverse_elasticity", place]
+    p = np.array([5e4, 30.0, *tilts[: len(h.parameters) - 2]])
+    there = turned(Effect(h, p))
+    (a,), (b,) = (x.hypothesis.options["change"](x.p).elasticities for x in (Effect(h, p), there))
+    assert np.abs(np.dot(a.axis, b.axis)) == pytest.approx(1.0) and (a.stiffness, a.damping, a.before) == (b.stiffness, b.damping, b.before)
+    assert np.all(np.abs(there.p[2:]) <= 1.0) and turned(there) is there and there.hypothesis.key == h.key
+
+
+def test_a_hinge_is_found_across_the_axis_from_which_it_was_sought(identified):
+    _, setup, result = identified
+    problem = setup.problem
+    first, second = (h for h in catalogue(problem.structure) if h.key == ("transverse_elasticity", "elbow_joint") and not h.options["before"])
+    models = result.model, replace(result.model, effects=(Effect(first, np.array([2e4, 20.0, 0.05])),))
+    before, after = (predictions(problem, m, [None] * len(problem.groups), steps=None) for m in models)
+    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
+    problem = replace(problem, groups=tuple(changed))
+    start = replace(result, model=replace(result.model, effects=(Effect(second, np.array([2e4, 20.0, 3.0])),)))
+    (found,) = polish(problem, start).model.effects
+    assert np.abs(np.dot(found.hypothesis.options["axis"](found.p), first.options["axis"]([1.0, 1.0, 0.05]))) > 0.9999
+    assert found.value("stiffness") == pytest.approx(2e4, rel=0.01)
 
 
 def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):

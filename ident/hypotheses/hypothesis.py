@@ -127,6 +127,7 @@ class Hypothesis:
             ``nats``: log odds before the data, 0 where there is no reason. ``body``: the link whose inertia it changes.
             ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a spring.
             ``filter(p, s)``: recorded torque per delivered one, or true position per measured one, of one that is linear, (L,).
+            ``nearer(p)``: the hypothesis of the same hinge sought from another axis, and its parameters, where its own is nearer to that.
             ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
     """
 

@@ -40,7 +40,7 @@ SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
 STIFFEST = 1e12  # N m/rad, of a hinge
 RESONANCES = 0.06, 0.12, 0.22, 0.35, 0.55, 0.85, 5.0  # of a hinge, over the highest line: far above it all answer alike
 FARTHEST_REST = 10.0  # of a balancing spring, rad or m
-MOST_TILT = 3.0  # of an elastic axis towards each other axis, in units of that along the one from which it is sought
+MOST_TILT = 3.0  # of an elastic axis towards each other axis, in units of that along the one from which it is sought in a fit
 YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
 
@@ -348,6 +348,13 @@ def compliance(
         direction = np.array(axes[0]) + np.asarray(p)[2:] @ np.array(axes[1:])
         return direction / np.linalg.norm(direction)
 
+    def nearer(p: np.ndarray) -> tuple[Hypothesis, np.ndarray] | None:
+        """The same hinge sought from the axis that is nearest; None where it is already."""
+        along = np.concatenate([[1.0], np.asarray(p)[2:]])
+        i = int(np.argmax(np.abs(along)))
+        others = np.roll(along, -i)[1:] / along[i]
+        return (compliance(place, joint_index, (*axes[i:], *axes[:i]), effect, before), np.array([*p[:2], *others])) if i else None
+
     def hinge(p: Sequence[float]) -> Elasticity:
         x, y, z = (float(v) for v in axis(p))
         return Elasticity(name, place, (x, y, z), float(p[0]), float(p[1]), before)
@@ -391,6 +398,7 @@ def compliance(
             "responses": responses,
             "hinge": at,
             "axis": axis,
+            "nearer": nearer,
             "before": before,
             "trivial": lambda p, k: p[0] > 0.1 * STIFFEST,
         },
