@@ -241,7 +241,10 @@ def explore(
         anywhere = "hinge" in score.hypothesis.options or score.gain >= scores[0].gain
         most = np.inf if anywhere else STRONG * (stage.count if stage.chi2_per_dof <= FAINT else stage.cost)
         model, cost = begin(problem, stage, score)
-        return refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most) if anywhere or cost <= most else None
+        result = refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most) if anywhere or cost <= most else None
+        if result is not None and turned(result.model.effects[-1]) is not result.model.effects[-1]:
+            return refit(problem, result.model, stage.weights, stage.remainders, FIRST_STEPS) or result
+        return result
 
     def finished(result: Fit) -> Fit:
         return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result

@@ -680,7 +680,8 @@ def fit(
             penalty = np.sum(prior * ((off + step) ** 2 - off**2))
             foretold = float(2.0 * b @ step - step @ H @ step)
             improved = bool(gain > penalty)
-            if improved or (slow and foretold < SLIGHT):
+            # A step whose parts are cut to size may be foretold to lead uphill: a shorter one does not.
+            if improved or (slow and abs(foretold) < SLIGHT):
                 break
             damping = max(damping, 1e-4) * 8
         if not improved:
