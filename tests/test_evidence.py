@@ -665,7 +665,7 @@ def test_what_a_law_leaves_at_its_joint_asks_for_no_hinge(identified, named, mon
     _, setup, result = identified
     count, told = result.counts, []
     stage = replace(result, costs=count * np.array([1.0, 1.0, 2.5, 1.0, 1.0, 1.0]))
-    monkeypatch.setattr("ident.search.refit", lambda *args: replace(stage, converged=True))
+    monkeypatch.setattr("ident.search.refit", lambda problem, model, *args: replace(stage, model=model, converged=True))
     monkeypatch.setattr("ident.search.hinges_everywhere", lambda *args: told.append(args) or [])
     for quiet, asked in (((), 1), ((2,), 1), ((3,), 2)):  # how often so far
         explore(setup.problem, stage, [named["unknown:drag_2", "elbow_joint"]], 0.0, np.inf, Workers(), quiet=frozenset(quiet))
