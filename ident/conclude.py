@@ -121,7 +121,7 @@ def conclude(
         unexplained_share=float(left),
         unexplained_verdict=verdict,
         gain=gain,
-        next_experiment=separating.text if separating else advice(causes, unknown),
+        next_experiment=separating.text if separating else advice(causes, unknown, len(dataset.joints)),
         sentence=sentence(causes, unknown, detected, gain),
         unidentified=undetermined,
         residual_description=description,

@@ -189,13 +189,18 @@ def _plan(problem: Problem, option: _Option) -> Plan:
     )
 
 
-def advice(causes: Sequence[Cause], unknown: bool) -> str | None:
-    """What to measure where no experiment was computed: by the names of the causes alone."""
+def advice(causes: Sequence[Cause], unknown: bool, axes: int) -> str | None:
+    """What to measure where no experiment was computed: by the names of the causes alone.
+
+    Args:
+        axes: of the robot; a single one has positions, and no postures that change what it carries.
+    """
+    postures, load = ("two more postures", "load") if axes > 1 else ("two more positions of the axis", "position")
     for cause in causes:
         if cause.probability < 0.9 and cause.alternatives:
             other = cause.alternatives[0]
-            what = ADVICE.get(frozenset({cause.effect, other.effect}), "two more postures and a second level of amplitude")
+            what = ADVICE.get(frozenset({cause.effect, other.effect}), f"{postures} and a second level of amplitude")
             return f"To tell {cause.effect} from {other.effect} at {cause.joint}: {what}."
     if unknown:
-        return "Two more levels of amplitude and two more postures, to see how the unknown cause scales with motion and load."
+        return f"Two more levels of amplitude and {postures}, to see how the unknown cause scales with motion and {load}."
     return None

@@ -10,7 +10,7 @@ from ident.evidence import Candidate
 from ident.excitation import plan_from_toml, plan_to_toml
 from ident.extended import Effect, Model
 from ident.hypotheses import catalogue
-from ident.next_experiment import _Option, _separation, moved, separating_experiment
+from ident.next_experiment import _Option, _separation, advice, moved, separating_experiment
 from ident.torque_fit import fit
 
 
@@ -79,3 +79,15 @@ def test_a_sure_cause_asks_for_nothing(fitted):
     problem, _, (gear, hard), (rub, friction) = fitted
     candidates = (Candidate(gear, hard, 0.0, 0.95), Candidate(rub, friction, -3.0, 0.05))
     assert separating_experiment(problem, SimpleNamespace(rounds=(SimpleNamespace(candidates=candidates),))) is None
+
+
+@pytest.mark.parametrize(("axes", "there"), [(6, "postures"), (1, "positions of the axis")])
+def test_advice_asks_for_what_the_robot_can_do(axes, there):
+    doubtful = SimpleNamespace(effect="cogging", joint="j", probability=0.6, alternatives=(SimpleNamespace(effect="payload", joint="flange"),))
+    assert f"two more {there}" in advice((doubtful,), True, axes) and "cogging from payload at j" in advice((doubtful,), True, axes)
+    sure = replace_probability(doubtful, 0.95)
+    assert f"two more {there}" in advice((sure,), True, axes) and advice((sure,), False, axes) is None
+
+
+def replace_probability(cause, probability):
+    return SimpleNamespace(**(vars(cause) | {"probability": probability}))
