@@ -18,8 +18,6 @@ demo: $(STAMP)
 	$(BIN)/simgap demo --out out/demo --seed 7
 
 # A process a core: threads in each would only wait for each other.
-test test-all: export OMP_NUM_THREADS = 1
-test test-all: export OPENBLAS_NUM_THREADS = 1
 test test-all: export SIMGAP_THREADS = 1
 
 test: $(STAMP)

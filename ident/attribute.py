@@ -145,7 +145,7 @@ def attribute(
             # Along the record noise is taken large, and hides other causes.
             current = looped = as_loops(problem, current, workers)
         told = baseline.costs - current.costs
-        asked, faint = hypotheses, not loud or settled(current) or settled(less_errors_of_laws(current, told))
+        asked, faint = hypotheses, not loud or settled(less_errors_of_laws(current, told))
         if faint:
             workers.say("what the noise as a whole would hide")
             asked, by_chance = hidden(problem, current, hypotheses, told)

@@ -101,6 +101,12 @@ def candidate(h, p, information, cost=1000.0):
     return Candidate(h, SimpleNamespace(model=model, information=H, cost=cost), 0.0)
 
 
+def recorded_with(problem, before, after):
+    """The problem as if what one model predicts beyond another were in its records."""
+    groups = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
+    return replace(problem, groups=tuple(groups))
+
+
 @pytest.fixture(scope="module")
 def named(identified):
     return {h.key: h for h in catalogue(identified[1].problem.structure)}
@@ -333,8 +339,7 @@ def test_a_dead_band_is_screened_where_gravity_has_led_the_gear_through_it(ident
     problem, gap, h = setup.problem, 1e-3, named["backlash", "elbow_joint"]
     models = result.model, replace(result.model, effects=(Effect(h, np.array([gap, 0.0])),))
     before, after = (predictions(problem, m, result.remainders, steps=8) for m in models)
-    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
-    problem = replace(problem, groups=tuple(changed))
+    problem = recorded_with(problem, before, after)
     bands = [x for x in named.values() if x.effect == "backlash"]
     first, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), bands)
     assert first.hypothesis is h and first.start == pytest.approx([gap, 0.0], rel=0.1)
@@ -348,8 +353,7 @@ def test_a_cause_begins_beside_the_drives_that_have_taken_its_place(identified, 
     softer = replace(par, stiffness=par.stiffness - extra * (np.arange(6) == j))
     truth = replace(result.model, par=softer, effects=(Effect(h, np.array([extra, 0.8, 20.0, 0.0])),))
     preds = (predictions(problem, m, result.remainders, steps=REMAINDER_STEPS) for m in (result.model, truth))
-    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, *preds, strict=True)]
-    problem = replace(problem, groups=tuple(changed))
+    problem = recorded_with(problem, *preds)
     moved = fit(problem, result.model)  # the drives take up what they can
     score, *_ = screen(problem, moved, predictions(problem, moved.model, moved.remainders), [h])
     costs = [
@@ -372,8 +376,7 @@ def test_a_hinge_far_above_the_band_is_screened_where_it_is(identified):
     assert np.sqrt(stiffness / own) > 1.5 * group.omega[group.n_compared - 1]
     models = result.model, replace(result.model, effects=(Effect(base, np.array([stiffness, 100.0, *tilts])),))
     before, after = (predictions(problem, m, result.remainders) for m in models)
-    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
-    problem = replace(problem, groups=tuple(changed))
+    problem = recorded_with(problem, before, after)
     first, second, *_ = screen(problem, result, predictions(problem, result.model, result.remainders), hinges)
     assert first.hypothesis is base and first.gain > 1.2 * second.gain
     assert first.start[0] == pytest.approx(stiffness, rel=0.3)
@@ -397,8 +400,7 @@ def test_a_hinge_is_found_across_the_axis_from_which_it_was_sought(identified):
     first, second = (h for h in catalogue(problem.structure) if h.key == ("transverse_elasticity", "elbow_joint") and not h.options["before"])
     models = result.model, replace(result.model, effects=(Effect(first, np.array([2e4, 20.0, 0.05])),))
     before, after = (predictions(problem, m, [None] * len(problem.groups), steps=None) for m in models)
-    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
-    problem = replace(problem, groups=tuple(changed))
+    problem = recorded_with(problem, before, after)
     start = replace(result, model=replace(result.model, effects=(Effect(second, np.array([2e4, 20.0, 3.0])),)))
     stage = reweighted(problem, result, result.weights)
     sought = explore(problem, stage, [second], 0.0, np.inf, Workers(), rough=True)[0][0][1]
@@ -406,6 +408,22 @@ def test_a_hinge_is_found_across_the_axis_from_which_it_was_sought(identified):
         (found,) = model.effects
         assert np.abs(np.dot(found.hypothesis.options["axis"](found.p), first.options["axis"]([1.0, 1.0, 0.05]))) > 0.9999
         assert found.value("stiffness") == pytest.approx(2e4, rel=0.01)
+
+
+@pytest.mark.parametrize(("tilt", "fits"), [(3.0, [0.0, 3.0]), (0.5, [0.0])])
+def test_a_candidate_that_turned_far_goes_on_before_it_is_compared(identified, named, monkeypatch, tilt, fits):
+    _, setup, result = identified
+    begun = []
+
+    def told(problem, model, *args):
+        (effect,) = model.effects
+        begun.append(effect.p[2])
+        there = replace(effect, p=np.array([*effect.p[:2], tilt if len(begun) == 1 else 0.0]))
+        return replace(result, model=replace(model, effects=(there,)), converged=True)
+
+    monkeypatch.setattr("ident.search.refit", told)
+    explore(setup.problem, result, [named["transverse_elasticity", "elbow_joint"]], 0.0, np.inf, Workers())
+    assert begun == fits
 
 
 def test_a_step_that_is_cut_to_lead_uphill_does_not_end_a_fit(ur10, named):
@@ -417,8 +435,7 @@ def test_a_step_that_is_cut_to_lead_uphill_does_not_end_a_fit(ur10, named):
     slip = Effect(named["hysteresis", "shoulder_pan_joint"], np.array([5e3, 1.0, 10.0, 0.0]))
     true = replace(result.model, effects=(slip, Effect(hinge, np.array([5e4, 30.0, 0.0]))))
     before, after = (predictions(problem, m, [None] * len(problem.groups), steps=None) for m in (result.model, true))
-    changed = [replace(g, U=g.U + b.U - a.U) for g, a, b in zip(problem.groups, before, after, strict=True)]
-    problem = replace(problem, groups=tuple(changed))
+    problem = recorded_with(problem, before, after)
     start = replace(true, effects=(slip, Effect(hinge, np.array([1.5e5, 3.0, 0.5]))))
     found = refit(problem, start, result.weights, result.remainders, 10)
     assert found.model.effects[1].value("stiffness") == pytest.approx(5e4, rel=0.02)

@@ -13,7 +13,7 @@ from ident.conclude import drift_note
 from ident.diagnosis import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
 from ident.extended import Effect, along_record, as_loop
-from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, left_by_laws, seen
+from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
 from ident.hypotheses import catalogue
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
 from ident.search import hopeful, refit
@@ -58,6 +58,7 @@ def test_noise_alone_shows_nothing_by_far(identified, hypotheses):
     _, setup, baseline = identified
     scores = faint_scores(setup.problem, baseline, hypotheses, np.zeros(6))
     assert 0.0 < scores[0].gain < 0.6 * SEEN and seen(scores, baseline) is None
+    assert hidden(setup.problem, baseline, hypotheses, np.zeros(6)) == ((), 1.0)
     found = attribute(setup.problem, baseline)
     assert not found.detected and not found.rounds and found.p_value > 1e-3
 

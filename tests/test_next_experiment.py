@@ -83,11 +83,7 @@ def test_a_sure_cause_asks_for_nothing(fitted):
 
 @pytest.mark.parametrize(("axes", "there"), [(6, "postures"), (1, "positions of the axis")])
 def test_advice_asks_for_what_the_robot_can_do(axes, there):
-    doubtful = SimpleNamespace(effect="cogging", joint="j", probability=0.6, alternatives=(SimpleNamespace(effect="payload", joint="flange"),))
+    other = SimpleNamespace(effect="payload", joint="flange")
+    doubtful, sure = (SimpleNamespace(effect="cogging", joint="j", probability=p, alternatives=(other,)) for p in (0.6, 0.95))
     assert f"two more {there}" in advice((doubtful,), True, axes) and "cogging from payload at j" in advice((doubtful,), True, axes)
-    sure = replace_probability(doubtful, 0.95)
     assert f"two more {there}" in advice((sure,), True, axes) and advice((sure,), False, axes) is None
-
-
-def replace_probability(cause, probability):
-    return SimpleNamespace(**(vars(cause) | {"probability": probability}))
