@@ -48,7 +48,7 @@ ISSUE_SIX = ("coulomb_friction", "cogging", "torque_constant", "torque_delay", "
 ARMS = ("ur10", "irb", "panda")
 KINDS = {"none": 0.15, "one": 0.5, "two": 0.2, "outside": 0.15}
 STEP = 0.01  # of the logarithm of a figure of the drives, to see what it does
-COARSE = 5e-4  # s, step of the simulations that see it: of their differences little is left of its error
+COARSE = 5e-4  # s, step of the simulations that tell sizes
 COUNTS = {"none": 0, "one": 1, "two": 2, "outside": 0}
 CASES = {"smoke": 6, "quick": 26, "sixty": 60, "full": 400}
 
@@ -80,7 +80,8 @@ class Case:
 
         Root mean square over the excited band of what changes in torque and position lines and no change of the drives would
         make, over the noise of these lines, in the first experiment at the largest level; the plant is simulated without noise,
-        for one steady period.
+        for one steady period. Its step is coarse: a size is a difference of two simulations, and of the error of the step little
+        is left in it.
         """
         plan, robot = self.plan, self.plan.robot
         shown = [e for e in shown_in(plan) if e.experiment == 1]
@@ -89,25 +90,22 @@ class Case:
         one = replace(small, excitation=replace(plan.excitation, periods=plan.excitation.transient_periods + 1))
         lines = int(plan.excitation.lines.max())
 
-        def run(plan: Plan, effects: Sequence = (), noise: float = 0.0) -> tuple[Segment, ...]:
-            return run_experiment(plan, effects, seed=self.seed, drives=self.drives, timestep=self.timestep, noise=noise).segments
+        def coarsely(plan: Plan, drives: dict, effects: Sequence = (), noise: float = 0.0) -> tuple[Segment, ...]:
+            options = {"timestep": COARSE, "integrator": "IMPLICITFAST", "noise": noise}
+            return run_experiment(plan, effects, seed=self.seed, drives=drives, **options).segments
 
-        def coarsely(drives: dict) -> np.ndarray:
-            data = run_experiment(one, seed=self.seed, drives=drives, timestep=COARSE, noise=0.0, integrator="IMPLICITFAST")
-            return spectra(data.segments, lines)
-
-        plain, short = spectra(run(one), lines), coarsely(self.drives)
-        noise = noise_power(run(small, noise=1.0), lines)
+        plain = spectra(coarsely(one, self.drives), lines)
+        noise = noise_power(coarsely(small, self.drives, noise=1.0), lines)
         others = [
             {**self.drives, name: values * np.exp(STEP * (np.arange(robot.n) == j))}
             for name, values in self.drives.items()
             for j in range(robot.n)
         ]
-        ways = np.stack([coarsely(drives) - short for drives in others])
+        ways = np.stack([spectra(coarsely(one, drives), lines) - plain for drives in others])
 
         def size(effect: object) -> float:
             try:
-                return distortion(spectra(run(one, [effect]), lines) - plain, ways, noise)
+                return distortion(spectra(coarsely(one, self.drives, [effect]), lines) - plain, ways, noise)
             except DataError:  # the loop is lost
                 return float("inf")
 
