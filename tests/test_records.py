@@ -67,10 +67,11 @@ def test_noise_of_a_motion_costs_as_much_as_it_counts(seconds):
     assert np.mean(costs) == pytest.approx(data_count(replace(problem)), rel=0.05)
 
 
-def moves_with_dwells(size, scale=1.0):
+def moves_with_dwells(size, scale=1.0, asymmetry=0.0):
     """Moves from point to point with dwells, in each of which dry friction of a ``size`` happens to balance another torque.
 
-    The torque that is recorded is the one delivered over ``scale``.
+    The torque that is recorded is the one delivered over ``scale``. Friction is ``1 + asymmetry`` times its size forwards, and
+    ``1 - asymmetry`` times backwards.
     """
     bench, rng = load_robot("twomass"), np.random.default_rng(3)
     fs, n = 500.0, 150
@@ -80,7 +81,8 @@ def moves_with_dwells(size, scale=1.0):
     q, friction = [], []
     for a, b in itertools.pairwise(angles):
         q += [a + (b - a) * step, np.full(100, b)]
-        friction += [np.full(n, size * np.sign(b - a)), np.full(100, rng.uniform(-size, size))]
+        held = rng.uniform(-size, size) + asymmetry * size
+        friction += [np.full(n, size * (np.sign(b - a) + asymmetry)), np.full(100, held)]
     q, friction = np.concatenate(q), np.concatenate(friction)
     v, joint = np.gradient(q, 1 / fs), bench.joints[0]
     inertia = joint.motor_inertia + 0.00477
@@ -112,6 +114,16 @@ def test_friction_at_rest_is_what_the_drive_asks_of_it():
     lines = group.observe(group.U)
     parts = stretch_squares(group, lines, 8)
     assert parts.shape == (8, 1) and parts.mean(axis=0) == pytest.approx(mean_squares(np.abs(lines) ** 2)[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("asymmetry", [-0.3, 0.5])
+def test_friction_that_differs_with_direction_balances_at_rest_what_is_asked_of_it(asymmetry):
+    verdict = diagnose(moves_with_dwells(0.8, asymmetry=asymmetry), max_causes=2)
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("coulomb_friction", "drive")]
+    found = verdict.causes[0].parameters
+    assert found["torque"].value == pytest.approx(0.8, rel=0.02)
+    assert found["asymmetry"].value == pytest.approx(asymmetry, abs=0.03)
+    assert verdict.gain.gap_closed > 0.85
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.6])

@@ -32,20 +32,41 @@ def direction(v: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
     return smooth_sign(np.ascontiguousarray(v), float(smoothing))
 
 
-def sense(motion: Motion, j: int, smoothing: float, size: np.ndarray | float | None = None) -> np.ndarray:
-    """Dry friction over its ``size`` (N m): the direction of the motion; where the motor stands still what balances the drive.
+def dry(
+    motion: Motion,
+    j: int,
+    smoothing: float,
+    size: np.ndarray | float,
+    back: np.ndarray | float | None = None,
+) -> np.ndarray:
+    """Dry friction (S, T), N m: its ``size`` in the direction of the motion; where the motor stands still what balances the drive.
 
     At rest dry friction is whatever the drive asks of it, up to its size (Coulomb 1785): no history of the velocity tells
-    it, and the recorded torque does. Without a size, as in a unit response, the rest itself says one.
+    it, and the recorded torque does.
+
+    Args:
+        back: the size in the other direction; the same where None.
     """
+    back = size if back is None else back
     s = direction(motion.v(j), smoothing)
+    moving = np.where(s > 0, size, back) * s
+    rest = resting(motion, j)
+    return moving if rest is None else np.where(rest, np.clip(motion.asked(j), -np.abs(back), np.abs(size)), moving)
+
+
+def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
+    """Dry friction (S, T) over its size, of which the rest itself says one."""
+    rest = resting(motion, j)
+    if rest is None:
+        return direction(motion.v(j), smoothing)
+    size = np.quantile(np.abs(motion.asked(j)[rest]), REST_QUANTILE)
+    return dry(motion, j, smoothing, size) / max(size, LEAST_TORQUE)
+
+
+def resting(motion: Motion, j: int) -> np.ndarray | None:
+    """Where the motor of a motion stands still (1, T); None where it never does, or that is not known."""
     rest = motion.group.rest
-    if rest is None or not np.any(rest[:, j]):
-        return s
-    asked = motion.asked(j)
-    if size is None:
-        size = np.quantile(np.abs(asked[:, rest[:, j]]), REST_QUANTILE)
-    return np.where(rest[:, j], np.clip(asked / np.maximum(size, LEAST_TORQUE), -1.0, 1.0), s)
+    return None if rest is None or not np.any(rest[:, j]) else rest[None, :, j]
 
 
 def held_at_start(motion: Motion, j: int, size: float) -> np.ndarray | None:
@@ -63,8 +84,7 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
     """``torque (sign v + asymmetry)`` (effects.md)."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        s = sense(motion, j, p[2], p[0])
-        return p[0] * (s + p[1] * np.abs(s))
+        return dry(motion, j, p[2], p[0] * (1.0 + p[1]), p[0] * (1.0 - p[1]))
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         s = sense(motion, j, shape[0])
@@ -99,7 +119,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         v = motion.v(j)
         size = p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-((v / p[2]) ** 2))
-        return sense(motion, j, p[3], size) * size
+        return dry(motion, j, p[3], size)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)
@@ -182,14 +202,9 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
 def load_dependent_friction(joint: int, place: str) -> Hypothesis:
     """``coefficient |tau_s| sign v`` (Bittencourt and Gunnarsson 2012)."""
 
-    def unit(motion: Motion, j: int, smoothing: float, coefficient: float | None = None) -> np.ndarray:
-        load = np.abs(motion.tau_s(j))
-        return load * sense(motion, j, smoothing, None if coefficient is None else coefficient * load)
-
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        return Screen(
-            (unit(motion, j, shape[0]),), lambda c: np.array([c[0], shape[0]]) if c[0] > 0 else None, shape
-        )
+        unit = np.abs(motion.tau_s(j)) * sense(motion, j, shape[0])
+        return Screen((unit,), lambda c: np.array([c[0], shape[0]]) if c[0] > 0 else None, shape)
 
     return Hypothesis(
         "load_dependent_friction",
@@ -197,7 +212,7 @@ def load_dependent_friction(joint: int, place: str) -> Hypothesis:
         joint,
         "motor",
         (Parameter("coefficient", "1", 1e-9, 2.0, log=True), SMOOTHING),
-        lambda p, motion, j, k: p[0] * unit(motion, j, p[1], p[0]),
+        lambda p, motion, j, k: dry(motion, j, p[1], p[0] * np.abs(motion.tau_s(j))),
         lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
         screen,
         "The friction torque of {joint} is {coefficient:.3g} of the torque it transmits: it differs"
@@ -212,18 +227,17 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
     Viscous and Coulomb friction change alike; ``relative_change`` is negative where they fall.
     """
 
-    def unit(
-        motion: Motion, j: int, tau: float, smoothing: float, size: float | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return motion.par.viscous[j] * motion.v(j), sense(motion, j, smoothing, size), 1.0 - np.exp(-motion.time / tau)
+    def warmth(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray]:
+        return motion.par.viscous[j] * motion.v(j), 1.0 - np.exp(-motion.time / tau)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        drag, s, warm = unit(motion, j, p[1], p[3], p[2])
-        return p[2] * s * (1.0 + p[0] * warm) + p[0] * warm * drag
+        drag, warm = warmth(motion, j, p[1])
+        return dry(motion, j, p[3], p[2] * (1.0 + p[0] * warm)) + p[0] * warm * drag
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         smoothing = 2e-3 * np.sqrt(np.mean(motion.v(j) ** 2))
-        drag, s, warm = unit(motion, j, shape[0], smoothing)
+        drag, warm = warmth(motion, j, shape[0])
+        s = sense(motion, j, smoothing)
 
         def start(c):
             coulomb = max(c[1], 1e-6)
@@ -323,7 +337,7 @@ def position_friction(joint: int, place: str) -> Hypothesis:
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         q = motion.q(j)
         size = p[0] + p[1] * q + p[2] * q**2
-        return size * sense(motion, j, p[3], np.abs(size))
+        return dry(motion, j, p[3], size)
 
     return Hypothesis(
         "unknown:position_friction",
