@@ -22,7 +22,7 @@ from numba import njit
 from ident.graybox import Parameters, Structure, equilibrium, linearise
 from ident.kalman import Kalman, held, kalman, spring_torque, state_space
 from ident.predict import Noise, Prediction, Predictor, Runs, gaussian
-from ident.recursion import _recursion, chain_of
+from ident.recursion import along_z, chain_of, recursion
 from robot_assets.errors import DataError
 
 NUDGE = 1e-6  # rad and rad/s, differences of inverse dynamics
@@ -70,14 +70,9 @@ def stepper(structure: Structure, par: Parameters, noise: Noise, q0: np.ndarray,
     )
 
 
-def _chain_arrays(structure: Structure) -> tuple[np.ndarray, ...]:
-    c = chain_of(structure.model)
-    return c.parent, c.prismatic, c.axis, c.rotation, c.origin, c.mass, c.lever, c.inertia, c.gravity
-
-
 def extended_kalman(structure: Structure, runs: Runs) -> Predictor:
     """Predictor by an extended Kalman filter of the arm with all its geometry, from rest or from a spread about it."""
-    chain = _chain_arrays(structure)
+    chain = along_z(chain_of(structure.model))
 
     def predict(par: Parameters, noise: Noise) -> Prediction:
         steps = [stepper(structure, par, noise, q, runs.sample_time) for q in runs.q0]
@@ -119,7 +114,7 @@ def particle_filter(
     """
     if runs.spread is not None:
         raise DataError("runs", "particle_filter", "some that begin in motion", "runs from rest")
-    chain = _chain_arrays(structure)
+    chain = along_z(chain_of(structure.model))
 
     def predict(par: Parameters, noise: Noise) -> Prediction:
         R, T, n = runs.y.shape
@@ -164,10 +159,8 @@ def _solve(M, B):
 
 @njit(cache=True, nogil=True)
 def _inverse_dynamics(chain, q, v, a):
-    parent, prismatic, axis, rotation, origin, mass, lever, inertia, gravity = chain
-    return _recursion(
-        parent, prismatic, axis, rotation, origin, mass, lever, inertia, gravity, q, np.sin(q), np.cos(q), v, a
-    )
+    parent, prismatic, rotation, origin, mass, lever, inertia, gravity = chain
+    return recursion(parent, prismatic, rotation, origin, mass, lever, inertia, gravity, q, np.sin(q), np.cos(q), v, a)
 
 
 @njit(cache=True, nogil=True)

@@ -13,6 +13,7 @@ import pinocchio as pin
 from numba import njit
 
 BLOCK = 256  # points
+FUSED = {"contract"}  # products with sums in one instruction
 
 
 @dataclass(frozen=True)
@@ -61,45 +62,53 @@ def newton_euler(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> n
     Source: Luh, Walker and Paul, J. Dyn. Syst. Meas. Control 102 (1980), in frames of the joints.
     """
     q, v, a = (np.ascontiguousarray(x) for x in (q, v, a))
-    return _recursion(
+    return recursion(*along_z(chain), q, np.sin(q), np.cos(q), v, a)
+
+
+def along_z(chain: Chain) -> tuple[np.ndarray, ...]:
+    """The arguments of ``recursion`` but the motion: the chain in frames turned so that each joint is along its ``z``.
+
+    To turn by a joint is a few products there.
+    """
+    z = np.array([_with_z(e) for e in chain.axis])
+    before = np.where((chain.parent < 0)[:, None, None], np.eye(3), z[chain.parent])
+    to_frame, from_parent = z.swapaxes(1, 2), before.swapaxes(1, 2)
+    return (
         chain.parent,
         chain.prismatic,
-        chain.axis,
-        chain.rotation,
-        chain.origin,
+        np.ascontiguousarray(from_parent @ chain.rotation @ z),
+        np.einsum("iab,ib->ia", from_parent, chain.origin),
         chain.mass,
-        chain.lever,
-        chain.inertia,
+        np.einsum("iab,ib->ia", to_frame, chain.lever),
+        np.ascontiguousarray(to_frame @ chain.inertia @ z),
         chain.gravity,
-        q,
-        np.sin(q),
-        np.cos(q),
-        v,
-        a,
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+def _with_z(axis: np.ndarray) -> np.ndarray:
+    """(3, 3) a rotation whose third column is a unit vector."""
+    other = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(other, axis)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis], axis=1)
+
+
+@njit(cache=True, nogil=True, inline="always", fastmath=FUSED)
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", fastmath=FUSED)
 def _add(a, b):
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", fastmath=FUSED)
 def _scaled(a, k):
     return a[0] * k, a[1] * k, a[2] * k
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", fastmath=FUSED)
 def _times(M, x):
     return (
         M[0, 0] * x[0] + M[0, 1] * x[1] + M[0, 2] * x[2],
@@ -108,7 +117,7 @@ def _times(M, x):
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", fastmath=FUSED)
 def _times_transposed(M, x):
     return (
         M[0, 0] * x[0] + M[1, 0] * x[1] + M[2, 0] * x[2],
@@ -117,15 +126,15 @@ def _times_transposed(M, x):
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _turned(x, axis, sine, cosine):
-    """Rodrigues: ``x`` turned about ``axis`` by an angle of that sine and cosine."""
-    along = _dot(axis, x) * (1.0 - cosine)
-    return _add(_add(_scaled(x, cosine), _scaled(_cross(axis, x), sine)), _scaled(axis, along))
+@njit(cache=True, nogil=True, inline="always", fastmath=FUSED)
+def _turned(x, sine, cosine):
+    """``x`` turned about ``z`` by an angle of that sine and cosine."""
+    return cosine * x[0] - sine * x[1], sine * x[0] + cosine * x[1], x[2]
 
 
-@njit(cache=True, nogil=True)
-def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, gravity, q, sine, cosine, v, a):
+@njit(cache=True, nogil=True, fastmath=FUSED)
+def recursion(parent, prismatic, rotation, origin, mass, lever, inertia, gravity, q, sine, cosine, v, a):
+    """``newton_euler`` for compiled callers; the chain as ``along_z`` gives it."""
     T, N = q.shape
     out = np.empty((T, N))
     w = np.empty((N, 3, BLOCK))
@@ -137,8 +146,8 @@ def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, 
         B = min(BLOCK, T - begin)
         for i in range(N):
             p, slides = parent[i], prismatic[i]
-            e = (axis[i, 0], axis[i, 1], axis[i, 2])
             c = (lever[i, 0], lever[i, 1], lever[i, 2])
+            z = (rotation[i, 0, 2], rotation[i, 1, 2], rotation[i, 2, 2])
             for b in range(B):
                 t = begin + b
                 if p < 0:
@@ -150,19 +159,19 @@ def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, 
                     acc_p = (acc[p, 0, b], acc[p, 1, b], acc[p, 2, b])
                 at = (origin[i, 0], origin[i, 1], origin[i, 2])
                 if slides:
-                    at = _add(at, _scaled(_times(rotation[i], e), q[t, i]))
+                    at = _add(at, _scaled(z, q[t, i]))
                 there = _add(_add(acc_p, _cross(dw_p, at)), _cross(w_p, _cross(w_p, at)))
                 w_i = _times_transposed(rotation[i], w_p)
                 dw_i = _times_transposed(rotation[i], dw_p)
                 acc_i = _times_transposed(rotation[i], there)
                 if slides:
-                    acc_i = _add(acc_i, _add(_scaled(_cross(w_i, e), 2.0 * v[t, i]), _scaled(e, a[t, i])))
+                    acc_i = (acc_i[0] + 2.0 * v[t, i] * w_i[1], acc_i[1] - 2.0 * v[t, i] * w_i[0], acc_i[2] + a[t, i])
                 else:
-                    w_i = _turned(w_i, e, -sine[t, i], cosine[t, i])
-                    dw_i = _turned(dw_i, e, -sine[t, i], cosine[t, i])
-                    acc_i = _turned(acc_i, e, -sine[t, i], cosine[t, i])
-                    dw_i = _add(dw_i, _add(_scaled(_cross(w_i, e), v[t, i]), _scaled(e, a[t, i])))
-                    w_i = _add(w_i, _scaled(e, v[t, i]))
+                    w_i = _turned(w_i, -sine[t, i], cosine[t, i])
+                    dw_i = _turned(dw_i, -sine[t, i], cosine[t, i])
+                    acc_i = _turned(acc_i, -sine[t, i], cosine[t, i])
+                    dw_i = (dw_i[0] + v[t, i] * w_i[1], dw_i[1] - v[t, i] * w_i[0], dw_i[2] + a[t, i])
+                    w_i = (w_i[0], w_i[1], w_i[2] + v[t, i])
                 f = _scaled(_add(_add(acc_i, _cross(dw_i, c)), _cross(w_i, _cross(w_i, c))), mass[i])
                 m = _add(_times(inertia[i], dw_i), _cross(w_i, _times(inertia[i], w_i)))
                 m = _add(m, _cross(c, f))
@@ -174,20 +183,20 @@ def _recursion(parent, prismatic, axis, rotation, origin, mass, lever, inertia, 
                     moment[i, k, b] = m[k]
         for i in range(N - 1, -1, -1):
             p, slides = parent[i], prismatic[i]
-            e = (axis[i, 0], axis[i, 1], axis[i, 2])
+            z = (rotation[i, 0, 2], rotation[i, 1, 2], rotation[i, 2, 2])
             for b in range(B):
                 t = begin + b
                 f = (force[i, 0, b], force[i, 1, b], force[i, 2, b])
                 m = (moment[i, 0, b], moment[i, 1, b], moment[i, 2, b])
-                out[t, i] = _dot(e, f) if slides else _dot(e, m)
+                out[t, i] = f[2] if slides else m[2]
                 if p < 0:
                     continue
                 at = (origin[i, 0], origin[i, 1], origin[i, 2])
                 if slides:
-                    at = _add(at, _scaled(_times(rotation[i], e), q[t, i]))
+                    at = _add(at, _scaled(z, q[t, i]))
                 else:
-                    f = _turned(f, e, sine[t, i], cosine[t, i])
-                    m = _turned(m, e, sine[t, i], cosine[t, i])
+                    f = _turned(f, sine[t, i], cosine[t, i])
+                    m = _turned(m, sine[t, i], cosine[t, i])
                 f = _times(rotation[i], f)
                 m = _add(_times(rotation[i], m), _cross(at, f))
                 for k in range(3):

@@ -15,6 +15,7 @@ from ident.frf import FRF
 from ident.graybox import Parameters, build_structure, equilibrium, impedance, linearise, parameter_names, sampled_frf
 from ident.kalman import StateSpace, innovations, kalman, local_predictor, state_space
 from ident.predict import Noise, Runs, fit_prediction, gaussian, runs_of, score
+from ident.recursion import along_z, chain_of
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import run_experiment
@@ -204,14 +205,14 @@ def test_particle_filter_repeats_itself(twomass):
 def test_a_remainder_is_stepped_to_second_order(pair):
     """A free swing in steps of 4, 2 and 1 ms: errors fall with the square of the step."""
     structure, par = build_structure(pair), Parameters.nominal(pair)
-    from ident.filters import _chain_arrays, _step
+    from ident.filters import _step
 
     noise, ends = Noise(pair.array("tau_std"), pair.array("q_std")), []
     for h in (4e-3, 2e-3, 1e-3, 1.25e-4):
         s = stepper(structure, par, noise, Q0, h)
         x = (s.x0 + np.repeat([0.0, 0.3], 4))[None]
         for _ in range(round(0.08 / h)):
-            x, _, _ = _step(_chain_arrays(structure), x, s.u0[None] + 20.0, s.x0, s.u0, s.A, s.B, s.hold, s.rise, s.springs, s.flat)
+            x, _, _ = _step(along_z(chain_of(structure.model)), x, s.u0[None] + 20.0, s.x0, s.u0, s.A, s.B, s.hold, s.rise, s.springs, s.flat)
         ends.append(x[0])
     errors = [np.linalg.norm(x[:4] - ends[-1][:4]) for x in ends[:-1]]
     assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3
