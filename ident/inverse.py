@@ -40,6 +40,7 @@ REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
 STALL_STEPS = 12  # in which the change must halve: where no motion repeats the search for one does not end
 NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
+ROUNDING = 1e-12  # of the recorded torque, below which a remainder is none
 REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
 REACTION_CHANGE = 1e-5  # relative change that ends them
 
@@ -339,7 +340,8 @@ def solve(
         W[left] = mixed(past)
         if react is not None:
             torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-        off = np.abs(change[left]).max(axis=(1, 2)) / np.abs(W).max()
+        # An axis that bears no gravity has no remainder but rounding.
+        off = np.abs(change[left]).max(axis=(1, 2)) / max(np.abs(W).max(), ROUNDING * np.abs(group.U).max())
         moving = off > enough
         changes.append(off.max())
         if not np.any(moving) or stalled(changes):
