@@ -126,6 +126,18 @@ def test_friction_that_differs_with_direction_balances_at_rest_what_is_asked_of_
     assert verdict.gain.gap_closed > 0.85
 
 
+def test_friction_that_drifts_balances_at_rest_what_is_asked_of_it():
+    setup = set_up(moves_with_dwells(0.8))
+    problem, (group,) = setup.problem, setup.problem.groups
+    h = next(h for h in catalogue(problem.structure) if h.effect == "friction_drift")
+    p = np.array([0.5, 5.0, 0.8, 1e-3])
+    motion = predict(Model(problem.structure, problem.nominal, (Effect(h, p),)), group, problem.sampling).motion(group)
+    rest, size = group.rest[:, 0], 0.8 * (1.0 + 0.5 * (1.0 - np.exp(-motion.time / 5.0)))
+    drag = 0.5 * (1.0 - np.exp(-motion.time / 5.0)) * problem.nominal.viscous[0] * motion.v(0)
+    held = np.clip(motion.asked(0), -size, size) + drag
+    assert h.law(p, motion, 0, problem.nominal.stiffness[0])[:, rest] == pytest.approx(held[:, rest])
+
+
 @pytest.mark.parametrize("scale", [0.5, 1.6])
 def test_friction_at_rest_balances_what_the_drive_delivers(scale):
     """A drive that delivers another torque than is recorded: at the true figures no more is left than with a right one."""
