@@ -148,7 +148,7 @@ def _motion(dataset: Dataset, name: str, group: Group) -> Motion:
     period = round(group.period_time * rate)
     at = np.arange(segment.n_samples) * group.n_time / period
     window = np.interp(at, np.arange(group.n_time), group.window)
-    rest = group.rest[np.minimum(at.astype(int), group.n_time - 1)]
+    rest = group.rest[0, np.minimum(at.astype(int), group.n_time - 1)]
     return Motion(segment.role, segment.q, segment.tau, segment.t, rate, rest, window, period, group.n_compared)
 
 

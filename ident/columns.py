@@ -63,6 +63,11 @@ class Columns:
             np.concatenate([self.whole_at[left], new]),
         )
 
+    def made_whole(self, dense: np.ndarray) -> Columns:
+        """Other columns (S, K, n, p), in the order of the coordinates, none of them a product."""
+        none = np.arange(0)
+        return Columns(self.products.pick(none), none, dense, np.arange(dense.shape[-1]))
+
     def normal(self, whiten: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (p, p) and right-hand side (p,) of real and imaginary parts.
 

@@ -28,7 +28,7 @@ from ident.hypotheses.sensing import torque_offset
 from ident.inverse import Sampling
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.next_experiment import separating_experiment
-from ident.noise import sample_noise, unexcited_noise
+from ident.noise import drifting, sample_noise, unexcited_noise
 from ident.parallel import Workers, one_thread_each
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
@@ -180,7 +180,9 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
         raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
-    problem = replace(with_measured_noise(setup.problem, result), scatter_share=result.share)
+    # Where periods differ by a drift, as those of a motor that sticks do, what they differ by is no noise.
+    share = 0.0 if np.any(drifting(setup.problem.groups)) else result.share
+    problem = replace(with_measured_noise(setup.problem, result), scatter_share=share)
     return replace(setup, problem=problem), result
 
 

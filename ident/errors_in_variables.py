@@ -18,22 +18,23 @@ from ident.columns import Products
 from ident.extended import Effect, Model, Prediction
 from ident.inverse import Sampling, make_plane
 from ident.records import Group
+from ident.stiction import as_held
 
 MOST = 0.9  # of the information on any direction of the coordinates, that may be taken off as noise
 CERTAINLY_MORE = 1.5  # what noise adds over all that there is, in some direction, that no scatter of its estimate explains
 STEADY = 1e-10  # relative, of a normal matrix of which an inverse is taken
 
 
-def scatter_costs(group: Group, pred: Prediction, whiten: np.ndarray) -> np.ndarray:
+def scatter_costs(group: Group, pred: Prediction, whiten: np.ndarray, still: np.ndarray | None = None) -> np.ndarray:
     """(n,) what noise of the means adds to the whitened cost, by joint.
 
     Args:
-        whiten: (K, n, n) of the compared lines.
+        whiten: (K, n, n) of the compared lines; still: of ``held_share``.
     """
     Z = pred.sampled_impedance[: len(whiten)]
     torque, across, position = group.scatter
     mixed = across @ _adjoint(Z)
-    covariance = torque - mixed - _adjoint(mixed) + Z @ position @ _adjoint(Z)
+    covariance = as_held(torque - mixed - _adjoint(mixed) + Z @ position @ _adjoint(Z), still)
     return np.einsum("kij,kjl,kil->i", whiten, covariance, whiten.conj(), optimize=True).real
 
 

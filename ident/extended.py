@@ -82,7 +82,8 @@ class Prediction:
 
     def motion(self, group: Group) -> Motion:
         drives = [e for e in self.model.effects if e.hypothesis.channel == "drive"]
-        return Motion(group, self.solution, self.par, delivered=delivered(drives, group, self.plane))
+        told = joints_along_record(self.model, group)
+        return Motion(group, self.solution, self.par, delivered=delivered(drives, group, self.plane), told=told)
 
     def outputs(self, group: Group) -> np.ndarray:
         """(S, L, n + M) predicted recorded torque, N m, and link positions, rad, as ``Group.outputs``."""
@@ -116,15 +117,15 @@ class Prediction:
         return recorded, true
 
 
-def joints_along_record(model: Model, group: Group) -> set[int]:
+def joints_along_record(model: Model, group: Group) -> frozenset[int]:
     """Joints whose gear is predicted along the record of a group.
 
     Not in a motion, and not where the drive has an effect: its record is not the torque of the motor.
     """
     if group.window is not None:
-        return set()
+        return frozenset()
     drives = {e.hypothesis.joint for e in model.effects if e.hypothesis.channel == "drive"}
-    return {e.hypothesis.joint for e in model.effects if is_along_record(e.hypothesis)} - drives
+    return frozenset(e.hypothesis.joint for e in model.effects if is_along_record(e.hypothesis)) - drives
 
 
 def predict(
@@ -181,13 +182,13 @@ def predict_at(
     along = joints_along_record(model, group)
     inner.sort(key=lambda e: e.hypothesis.joint in along and is_along_record(e.hypothesis))  # after what else is at the gear
     drives = by_channel.get("drive", [])
-    given = delivered(drives, group, plane)
+    given = delivered(drives, group, plane) if any(is_dry(e) for e in motor) else None
     react = partial(_inner_torques, structure, par, plane, group, effects=inner, motors=motor, given=given, along=along) if inner else None
     passes = 1 if len(inner) == 1 and has_loop(inner[0]) else REACTION_STEPS
     start = torques if inner else Torques()
     solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps)
     if motor:
-        motion = Motion(group, solution, par, delivered=given)
+        motion = Motion(group, solution, par, delivered=given, told=along)
         at_motors = plane.record[:, None] * _motor_torques(par, motion, motor)
         solution = replace(solution, U=solution.U + at_motors)
     U = through_drives(drives, Motion(group, solution, par))
@@ -245,7 +246,7 @@ def _inner_torques(
     effects: Sequence[Effect],
     motors: Sequence[Effect],
     given: np.ndarray | None,
-    along: set[int],
+    along: frozenset[int],
 ) -> Torques:
     """Spring and link torques of effects, solved together with the arm they act on.
 
@@ -258,7 +259,7 @@ def _inner_torques(
     """
     S, L, n = solution.Q.shape
     motor = np.zeros((S, L, n), complex)
-    motion = Motion(group, solution, par, delivered=given)
+    motion = Motion(group, solution, par, delivered=given, told=along)
     at_gear: dict[int, np.ndarray] = {}
     at_link: dict[int, np.ndarray] = {}
     loops = []

@@ -161,6 +161,7 @@ class Motion:
 
     ``beside``: spectra (S, L, n) of what else acts at the motors, N m. ``error``: the same, rad, by which the position
     that laws see is taken off. ``delivered``: the same, N m, what the motors deliver by the record; the record itself where None.
+    ``told``: joints at which the record says another torque already, and none of a friction at rest.
     """
 
     group: Group
@@ -169,6 +170,7 @@ class Motion:
     beside: np.ndarray | float = 0.0
     error: np.ndarray | float = 0.0
     delivered: np.ndarray | None = None
+    told: frozenset[int] = frozenset()
 
     def q(self, joint: int) -> np.ndarray:
         """Motor position without lines of noise alone, rad."""
@@ -176,7 +178,8 @@ class Motion:
 
     def v(self, joint: int) -> np.ndarray:
         """Motor velocity without lines of noise alone, rad/s."""
-        return self._shown(joint, 1)
+        fast, v = self.group.fast_velocity, self._shown(joint, 1)
+        return v if fast is None else v + fast[..., joint]
 
     def acceleration(self, joint: int) -> np.ndarray:
         """Motor acceleration, rad/s2."""

@@ -18,7 +18,7 @@ from ident.extended import (
     simulated_laws,
 )
 from ident.hypotheses import kernels
-from ident.inverse import Motion, Solution
+from ident.inverse import Solution
 from ident.records import NOISE_LINES, Group, mean_over_lines, signal_share
 
 NOISE_DRAWS = 4  # of the noise that laws of the gear answer to
@@ -38,8 +38,7 @@ def law_noise(pred: Prediction, group: Group) -> np.ndarray:
         return out
     rng = np.random.default_rng(0)
     draw = rng.normal(size=(2, *pred.U.shape)) * np.sqrt(0.5 * group.shown_error)
-    moving = replace(group, rest=None)  # at rest the noise of the position cancels
-    seen = Motion(moving, pred.solution, pred.par)
+    seen = pred.motion(group)
     motions = replace(seen, error=draw[0] + 1j * draw[1]), seen
     for effect in at_motor:
         j = effect.hypothesis.joint

@@ -26,10 +26,13 @@ END_SAMPLES = 12  # at least
 REST_TIME, REST_SAMPLES = 0.05, 5  # s, and samples at least, within which a motor that stands still does not move
 REST_NOISE = 6.0  # beyond this many standard deviations of its noise
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
+BORDER_SAMPLES = 8  # at either end of a period, from which it is told where it begins and ends
+CREEP = 6.0  # standard deviations of their noise, by which both must differ
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 NOISE_LINES = 10  # lines on either side over which the noise of the position is averaged
 SIGNAL_LEVEL = 2.0  # power over noise below which a line of the position counts as noise
+FAST_LEVEL = 1.5  # the same of the mean power of lines near by: that of noise alone differs by less from its own mean
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
 MOTION_BAND = 1.5  # the same of motions
 FAST_BAND = 6.0  # of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
@@ -60,7 +63,9 @@ class Group:
         temperature: (S, n) degC means, or None.
         period_time: s.
         periods: (S,) number of periods averaged.
-        rest: (n_time, n) where the motors of a motion stand still, or None for periodic data.
+        rest: (S, n_time, n) where motors stand still, or turn.
+        Q_fast: (S, F, n) mean spectra of the position beyond lines 0..L-1, as far as they are signal and the time grid reaches;
+            None of a motion.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -85,6 +90,7 @@ class Group:
     white_noise: np.ndarray
     white_torque_noise: np.ndarray
     rest: np.ndarray | None = None
+    Q_fast: np.ndarray | None = None
     link_std: np.ndarray | None = None
     links: tuple[int, ...] = ()
     n_slow: int | None = None
@@ -143,6 +149,16 @@ class Group:
         return np.maximum(mean, 0.0)
 
     @cached_property
+    def fast_velocity(self) -> np.ndarray | None:
+        """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps; None of a motion."""
+        if self.Q_fast is None:
+            return None
+        L, count = len(self.omega), self.Q_fast.shape[1]
+        V = np.zeros((len(self.Q_fast), L + count, self.Q_fast.shape[2]), complex)
+        V[:, L:] = 2j * np.pi / self.period_time * np.arange(L, L + count)[:, None] * self.Q_fast
+        return self.to_time(V)
+
+    @cached_property
     def torque_share(self) -> np.ndarray:
         """(S, L, n) the same of the torque: a law that clips it would clip its noise, and so explain that."""
         return signal_share(self.U, self.torque_noise)
@@ -159,7 +175,7 @@ class Group:
 
     def pick(self, rows: np.ndarray) -> Group:
         """The group with some of its segments."""
-        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods")
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods", "rest", "Q_fast")
         parts = {name: getattr(self, name) for name in names}
         kept = {name: None if x is None else x[rows] for name, x in parts.items()}
         return replace(self, segments=tuple(self.segments[i] for i in rows), **kept)
@@ -169,7 +185,7 @@ class Group:
         names = ("U", "Q", "U_periods", "Q_periods", "Q_link")
         parts = {name: getattr(self, name) for name in names}
         cut = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
-        return replace(self, omega=self.omega[: self.n_slow], excited=self.excited[:, : self.n_slow], n_slow=None, **cut)
+        return replace(self, omega=self.omega[: self.n_slow], excited=self.excited[:, : self.n_slow], n_slow=None, Q_fast=None, **cut)
 
     @property
     def window_share(self) -> float:
@@ -227,6 +243,16 @@ def _line_noise(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
     d = X_periods - X_periods.mean(axis=1, keepdims=True)
     power = np.sum(np.abs(d) ** 2, axis=(0, 1)) / (len(d) * (P - 1) * P)
     return mean_over_lines(power, NOISE_LINES)
+
+
+def _signal(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Mean (S, L, n) over periods (S, P, L, n) of lines that hold little but noise, each by the share of signal near by (Wiener 1949)."""
+    mean = X_periods.mean(axis=1)
+    if not mean.shape[1]:
+        return mean
+    power = mean_over_lines((np.abs(mean) ** 2).swapaxes(0, 1), NOISE_LINES).swapaxes(0, 1)
+    noise = _line_noise(X_periods, white)
+    return np.maximum(1.0 - FAST_LEVEL * noise / np.maximum(power, 1e-300), 0.0) * mean
 
 
 def signal_share(X: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -305,17 +331,22 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
     fs, N = dataset.sample_rate, int(first.period)
     top = min(int(np.floor(band_hz * N / fs + 1e-9)), N // 2 - 1)
     n_lines = min(int(np.ceil(SIGNAL_BAND * top)) + 2, N // 2)
-    U_p = np.stack([_lines(s.periodic("tau"), n_lines) for s in members])
-    Q_p = np.stack([_lines(s.periodic("q"), n_lines) for s in members])
+    q = [without_creep(s.periodic("q")) for s in members]
+    U_p = np.stack([_lines(without_creep(s.periodic("tau")), n_lines) for s in members])
+    Q_p = np.stack([_lines(x, n_lines) for x in q])
     link = None
     if all(s.q_link is not None for s in members):
-        link = np.stack([_lines(s.periodic("q_link"), n_lines).mean(axis=0) for s in members])
+        link = np.stack([_lines(without_creep(s.periodic("q_link")), n_lines).mean(axis=0) for s in members])
     excited = np.zeros((len(members), n_lines), bool)
     for i, s in enumerate(members):
         lines = np.asarray(s.excited_lines, int)
         excited[i, lines[lines < n_lines]] = True
     temps = [s.temp for s in members]
-    return Group(
+    n_time = scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True)
+    white_noise = np.mean([difference_noise(s.q) ** 2 for s in members], axis=0) / N
+    fast = np.stack([_lines(x, min(N // 2, (n_time + 1) // 2))[:, n_lines:] for x in q])
+    at = np.arange(n_time) * N // n_time
+    group = Group(
         operating_point=str(first.operating_point),
         segments=tuple(s.name for s in members),
         U=U_p.mean(axis=1),
@@ -326,21 +357,41 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
         omega=2 * np.pi * np.arange(n_lines) * fs / N,
         n_compared=top + 1,
         excited=excited,
-        n_time=scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True),
+        n_time=n_time,
         window=None,
         amplitude=np.array([s.amplitude for s in members]),
         start=np.array([began[s.name] for s in members]) + _middle_periods(members) * N / fs,
         temperature=None if any(x is None for x in temps) else np.stack([x.mean(axis=0) for x in temps]),
         period_time=N / fs,
         periods=np.array([s.steady_periods for s in members]),
-        white_noise=np.mean([difference_noise(s.q) ** 2 for s in members], axis=0) / N,
+        white_noise=white_noise,
         white_torque_noise=np.mean([difference_noise(s.tau) ** 2 for s in members], axis=0) / N,
+        Q_fast=_signal(fast, white_noise),
+        rest=np.stack([_at_rest_in_period(x, fs, 0.5 * N / fs / n_lines)[at] for x in q]),
     )
+    return replace(group, rest=group.rest | _turning(group))
 
 
 def _middle_periods(members: list[Segment]) -> np.ndarray:
     """Periods from the start of a segment to that of the mean of its steady ones."""
     return np.array([s.transient_periods + 0.5 * (s.steady_periods - 1) for s in members])
+
+
+def without_creep(x: np.ndarray) -> np.ndarray:
+    """Periods (P, N, n) less the line that leads from where they begin to where they end, where that is elsewhere.
+
+    What ends elsewhere than it began, as a motor that sticks and creeps does, has lines of its jump. A steady velocity is a motion
+    of the arm too: less that, what is left repeats.
+    """
+    P, N, _ = x.shape
+    if P < 2:
+        return x
+    width = min(BORDER_SAMPLES, N)
+    # From the start of the first period to that of the second, and from the end of the first to that of the last.
+    jump = (x[1] - x[0])[:width].mean(axis=0) + (x[-1] - x[0])[-width:].mean(axis=0)
+    noise = 2.0 * difference_noise(x.reshape(P * N, -1)) / np.sqrt(width)
+    at = np.arange(P * N).reshape(P, N, 1) - 0.5 * (P * N - 1)
+    return x - at * np.where(np.abs(jump) > CREEP * noise, jump, 0.0) / (P * N)
 
 
 def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:
@@ -393,18 +444,44 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
         white_torque_noise=difference_noise(segment.tau) ** 2 / N,
         link_std=None if segment.q_link is None else difference_noise(segment.q_link),
         n_slow=n_slow,
-        rest=_at_rest(segment.q, fs)[np.minimum((time * fs).astype(int), len(segment.t) - 1)],
+        rest=_at_rest(segment.q, fs, REST_TIME)[None, np.minimum((time * fs).astype(int), len(segment.t) - 1)],
     )
 
 
-def _at_rest(q: np.ndarray, fs: float) -> np.ndarray:
-    """Where motors stand still (N, n): samples in windows of ``REST_TIME`` that hold no more than noise, or a step of the encoder."""
-    width = max(round(REST_TIME * fs), REST_SAMPLES)
+def _at_rest(q: np.ndarray, fs: float, span: float) -> np.ndarray:
+    """Where motors stand still (N, n): samples in windows of ``span`` seconds that hold no more than noise, or a step of the encoder."""
+    return _still(q, max(round(span * fs), REST_SAMPLES), _stillness(q, 1), "nearest")
+
+
+def _at_rest_in_period(q: np.ndarray, fs: float, span: float) -> np.ndarray:
+    """The same of the mean over periods (P, N, n)."""
+    level = _stillness(q.reshape(-1, q.shape[-1]), len(q))
+    return _still(q.mean(axis=0), max(round(span * fs), REST_SAMPLES), level, "wrap")
+
+
+def _stillness(q: np.ndarray, count: int) -> np.ndarray:
+    """(n,) what means over ``count`` positions (N, n) of motors that stand still differ by, rad: noise, or a step of the encoder."""
     steps = np.abs(np.diff(q, axis=0))
     least = np.min(np.where(steps > 0, steps, np.inf), axis=0)
-    level = np.maximum(REST_NOISE * difference_noise(q), np.where(np.isfinite(least), 1.5 * least, 0.0))
-    span = scipy.ndimage.maximum_filter1d(q, width, axis=0) - scipy.ndimage.minimum_filter1d(q, width, axis=0)
-    return scipy.ndimage.maximum_filter1d((span <= level).astype(np.uint8), width, axis=0) > 0
+    return np.maximum(REST_NOISE * difference_noise(q) / np.sqrt(count), np.where(np.isfinite(least), 1.5 * least, 0.0))
+
+
+def _turning(group: Group) -> np.ndarray:
+    """(S, n_time, n) where the velocity of a periodic motion turns between two points of the grid.
+
+    Dry friction jumps there, and with it the acceleration: in a motion whose lines end the velocity turns too late.
+    """
+    v = group.to_time(1j * group.omega[:, None] * group.signal_share * group.Q) + group.fast_velocity
+    turns = v * np.roll(v, -1, axis=1) <= 0.0
+    return turns | np.roll(turns, 1, axis=1)
+
+
+def _still(q: np.ndarray, width: int, level: np.ndarray, mode: str) -> np.ndarray:
+    """Samples (N, n) in windows of ``width`` within which positions differ by no more than ``level``."""
+    span = scipy.ndimage.maximum_filter1d(q, width, axis=0, mode=mode) - scipy.ndimage.minimum_filter1d(q, width, axis=0, mode=mode)
+    # An even window reaches one sample further back than ahead: the windows that hold a sample reach the other way.
+    origin = -1 if width % 2 == 0 else 0
+    return scipy.ndimage.maximum_filter1d((span <= level).astype(np.uint8), width, axis=0, mode=mode, origin=origin) > 0
 
 
 def close_motion(x: np.ndarray, n_return: int, fs: float, *, curvature: bool) -> np.ndarray:

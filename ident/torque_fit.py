@@ -42,6 +42,7 @@ from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
 from ident.posture import moved_by_posture
 from ident.records import Group
+from ident.stiction import as_free, held, held_share
 
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
@@ -382,7 +383,15 @@ def jacobian(
         for i in range(len(model.effects))
         for column in _effect_columns(problem, model, group, pred, now, i, exact, posture)
     ]
-    return baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
+    columns = baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
+    still = held(pred, group)
+    if still is None:
+        return columns
+    # Differences of laws at the motors have it in them.
+    dense, at_motors = columns.dense(), np.array([e.hypothesis.channel == "motor" for e in model.effects for _ in e.p])
+    passed = np.concatenate([np.ones(m + 1, bool), ~at_motors])
+    dense[..., passed] = as_free(dense[..., passed], still, group)
+    return columns.made_whole(dense)
 
 
 def _baseline(model: Model, pred: Prediction, top: int) -> Products:
@@ -856,9 +865,15 @@ def has_scatter(problem: Problem, model: Model) -> bool:
     return all(g.scatter is not None and not joints_along_record(model, g) for g in problem.groups)
 
 
-def by_noise(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
-    """(n,) what noise adds to ``joint_costs`` (``errors_in_variables``)."""
-    each = zip(problem.groups, preds, weights.whiten, strict=True)
+def by_noise(
+    problem: Problem, preds: Sequence[Prediction], weights: Weights, still: Sequence[np.ndarray | None] | None = None
+) -> np.ndarray:
+    """(n,) what noise adds to ``joint_costs`` (``errors_in_variables``).
+
+    Args:
+        still: of ``held_share``, of each group; of motors that nothing holds where None.
+    """
+    each = zip(problem.groups, preds, weights.whiten, still or [None] * len(preds), strict=True)
     return sum(scatter_costs(*of) for of in each)
 
 
@@ -872,7 +887,8 @@ def noise_of(problem: Problem, preds: Sequence[Prediction], weights: Weights, la
     for group, of_laws, whiten in zip(problem.groups, laws, weights.whiten, strict=True):
         more = of_laws[: len(whiten)]
         each.append(_records(group) * np.einsum("kij,kjl,kil->i", whiten, more, whiten.conj(), optimize=True).real)
-    return by_noise(problem, preds, weights) + _by_joint(problem, each)
+    still = [held_share(*of) for of in zip(preds, problem.groups, strict=True)]
+    return by_noise(problem, preds, weights, still) + _by_joint(problem, each)
 
 
 def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:

@@ -18,7 +18,9 @@ LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
+MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
+PROJECTIONS = 2  # of what is asked at rest, onto what dry friction can be
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
 
@@ -51,7 +53,16 @@ def dry(
     s = direction(motion.v(j), smoothing)
     moving = np.where(s > 0, size, back) * s
     rest = resting(motion, j)
-    return moving if rest is None else np.where(rest, np.clip(motion.asked(j), -np.abs(back), np.abs(size)), moving)
+    if rest is None:
+        return moving
+    asked, least, most = motion.asked(j), -np.abs(back), np.abs(size)
+    friction = np.where(rest, np.clip(asked, least, most), moving)
+    # Of what is asked only some lines are known, and its jumps ring: what has these lines within the limits is sought, by projection
+    # onto one and the other in turn (Papoulis 1975).
+    for _ in range(PROJECTIONS):
+        missing = asked - motion.group.to_time(motion.lines(friction)[..., None])[..., 0]
+        friction = np.where(rest, np.clip(friction + missing, least, most), moving)
+    return friction
 
 
 def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
@@ -64,9 +75,9 @@ def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
 
 
 def resting(motion: Motion, j: int) -> np.ndarray | None:
-    """Where the motor of a motion stands still (1, T); None where it never does, or that is not known."""
+    """Where a motor stands still (S, T); None where it never does, or that is not known."""
     rest = motion.group.rest
-    return None if rest is None or not np.any(rest[:, j]) else rest[None, :, j]
+    return None if rest is None or j in motion.told or not np.any(rest[..., j]) else rest[..., j]
 
 
 def held_at_start(motion: Motion, j: int, size: float) -> np.ndarray | None:
@@ -193,6 +204,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0], p[2]]),
             "apart": "stiffness",
             "give": lambda p: p[1] / p[0],
+            "trivial": lambda p, k: p[1] > MOST_GIVE * p[0],
             "special": lambda p: np.array([p[1], 0.0, SHARP]),
             "widens": lambda p, s: [np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL]) for f in (0.02, 0.2)],
         },

@@ -1,0 +1,201 @@
+"""Motors that stick: friction of a set of values at rest, in periodic records.
+
+The bench is simulated here, apart from the plant of the project: two inertias on a spring, and friction at the motor that
+holds it as long as no more than its static size is asked, to the step (Karnopp 1985).
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numba import njit
+
+from ident.dataset import Dataset, Segment
+from ident.diagnosis import diagnose, set_up
+from ident.extended import Effect, Model, predict
+from ident.hypotheses import catalogue
+from ident.records import Group, build_groups, without_creep
+from ident.stiction import LEFT_HELD, as_held, held, held_share
+from ident.torque_fit import jacobian, noise_covariance, pack, residual, unpack
+from robot_assets.robot import load_robot
+
+FS, PERIOD, PERIODS, STEPS = 1000.0, 2000, 3, 16
+MOTOR, LOAD, SPRING, DAMPER, VISCOUS = 0.004, 0.00477, 380.0, 0.03, 0.02
+GAINS = 6.0, 0.05  # N m/rad and N m s/rad, of the loop
+NOISE = 4e-6, 2e-2  # rad and N m
+COULOMB, STATIC, STRIBECK = 0.3, 0.55, 0.4  # N m, N m, rad/s
+
+
+@njit(cache=True)
+def kick(h, u, x, v, y, w, coulomb, static, stribeck):
+    """Velocities of motor and load after a time ``h`` at the same positions."""
+    gear = SPRING * (x - y) + DAMPER * (v - w)
+    drive = u - gear - VISCOUS * v
+    w += h * gear / LOAD
+    if v == 0.0:
+        size = min(abs(drive), static)
+        return h * (drive - (size if drive > 0 else -size)) / MOTOR, w
+    size = coulomb + (static - coulomb) * np.exp(-((v / stribeck) ** 2))
+    new = v + h * (drive - (size if v > 0 else -size)) / MOTOR
+    return (0.0 if new * v < 0.0 else new), w
+
+
+@njit(cache=True)
+def run_bench(reference, feed, coulomb, static, stribeck, q_noise, offset):
+    """Sampled torque, position, and whether the motor stuck at the sample, of a loop of samples with a held torque."""
+    n, h = len(reference), 1.0 / (FS * STEPS)
+    tau, q, stuck = np.empty(n), np.empty(n), np.zeros(n)
+    x, v, y, w = offset, 0.0, offset, 0.0
+    last = offset
+    for k in range(n):
+        q[k] = x + q_noise[k]
+        u = feed[k] + GAINS[0] * (reference[k] - q[k]) - GAINS[1] * (q[k] - last) * FS
+        last, tau[k] = q[k], u
+        stuck[k] = 1.0 if v == 0.0 else 0.0
+        for _ in range(STEPS):
+            v, w = kick(0.5 * h, u, x, v, y, w, coulomb, static, stribeck)
+            x += h * v
+            y += h * w
+            v, w = kick(0.5 * h, u, x, v, y, w, coulomb, static, stribeck)
+    return tau, q, stuck
+
+
+@cache
+def sticking(static=COULOMB, seed=0):
+    """Records at two postures and three levels, those at a third posture held out; and the share of samples at rest, by segment."""
+    bench, rng = load_robot("twomass"), np.random.default_rng(seed)
+    lines = np.arange(1, 181)
+    t, segments, shares = np.arange(PERIODS * PERIOD) / FS, [], {}
+    for posture, offset in (("a", 0.0), ("b", 0.7), ("c", -0.4)):
+        for level in (1.0, 0.4, 0.2):
+            X = np.zeros(PERIOD // 2 + 1, complex)
+            X[lines] = np.exp(2j * np.pi * rng.uniform(size=lines.size))
+            feed = np.fft.irfft(X, n=PERIOD)
+            feed = np.tile(1.6 * level * feed / feed.std(), PERIODS + 1)
+            noise = NOISE[0] * rng.normal(size=len(feed))
+            tau, q, stuck = run_bench(np.full(len(feed), offset), feed, COULOMB, static, STRIBECK, noise, offset)
+            tau, q, stuck = (x[PERIOD:] for x in (tau + NOISE[1] * rng.normal(size=len(feed)), q, stuck))
+            name = f"{posture}{level}"
+            shares[name] = stuck.mean()
+            segments.append(
+                Segment(
+                    name, "multisine", "validation" if posture == "c" else "identification", t, tau[:, None], q[:, None],
+                    operating_point=posture, q0=np.array([offset]), period=PERIOD, periods=PERIODS, amplitude=level, excited_lines=lines,
+                )
+            )  # fmt: skip
+    data = Dataset("sticking", "twomass", bench, FS, bench.joint_names, "zoh", np.array([NOISE[0]]), np.array([NOISE[1]]), None, tuple(segments))
+    return data, shares
+
+
+def friction(effect, p):
+    """The bench as it is, with a friction."""
+    problem = set_up(sticking()[0]).problem
+    h = next(h for h in catalogue(problem.structure) if h.effect == effect)
+    par = replace(
+        problem.nominal, inertia=np.array([MOTOR]), stiffness=np.array([SPRING]), damping=np.array([DAMPER]), viscous=np.array([VISCOUS])
+    )
+    return problem, Model(problem.structure, par, (Effect(h, np.array(p)),))
+
+
+def test_where_motors_stick_is_known():
+    data, shares = sticking()
+    assert shares["a0.2"] > 0.3 > shares["a0.4"] > shares["a1.0"] > 0.0
+    for group in build_groups(data):
+        for name, rest in zip(group.segments, group.rest, strict=True):
+            # And where they turn between two points of the grid.
+            assert shares[name] < rest.mean() < shares[name] + 0.25
+
+
+def test_dry_friction_that_sticks_leaves_little():
+    """At its true figures, where the motor sticks most: a hundred times as much without what rest says."""
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    group = problem.groups[0]
+    pred = predict(model, group, problem.sampling)
+    blind = predict(model, replace(group, rest=None), problem.sampling)
+    noise = noise_covariance(problem, group, pred)[:, 0, 0].real
+    left, unknown = (np.mean(np.abs(residual(group, x))[..., 0] ** 2 / noise, axis=1) for x in (pred, blind))
+    assert left[-1] < 6.0
+    assert unknown[-1] > 50.0 * left[-1]
+
+
+@pytest.mark.parametrize("static", [COULOMB, STATIC])
+def test_friction_that_sticks_is_named(static):
+    verdict = diagnose(sticking(static)[0], max_causes=2)
+    effect = "coulomb_friction" if static == COULOMB else "stribeck_friction"
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [(effect, "drive")]
+    found = verdict.causes[0].parameters
+    if static == COULOMB:
+        assert found["torque"].value == pytest.approx(COULOMB, rel=0.03) and abs(found["asymmetry"].value) < 0.02
+    else:
+        assert found["static"].value == pytest.approx(STATIC, rel=0.05)
+        assert found["stribeck_velocity"].value == pytest.approx(STRIBECK, rel=0.15)
+    assert verdict.gain.gap_closed > 0.95
+
+
+def test_what_rest_leaves_of_noise():
+    """Covariance of lines of coloured noise at two joints, one of which is held now and then, against draws."""
+    rng, T, K, draws = np.random.default_rng(4), 600, 90, 4000
+    mix = np.array([[1.0, 0.0], [0.6, 0.8]])
+    shape = np.where(np.arange(T // 2 + 1) < K, 1.0 + (np.arange(T // 2 + 1) / 30.0) ** 2, 0.0)
+    free = np.ones((1, T, 2))
+    free[0, 100:180, 0] = free[0, 300:340, 0] = free[0, 500:507, 0] = 0.3
+    lines = (rng.normal(size=(draws, T // 2 + 1, 2)) + 1j * rng.normal(size=(draws, T // 2 + 1, 2))) * np.sqrt(0.5)
+    lines = (lines @ mix.T) * shape[:, None]
+    lines[:, 0] = 0.0
+    seen = np.fft.rfft(np.fft.irfft(lines, n=T, axis=1, norm="forward") * free, axis=1, norm="forward")[:, :K]
+    drawn = np.einsum("dki,dkj->kij", seen, seen.conj()) / draws
+    M = np.fft.fft(free[0], axis=0, norm="forward")
+    share = np.fft.ifft(np.einsum("ki,kj->kij", M, M.conj()), axis=0, norm="forward")
+    S = shape[:K, None, None] ** 2 * (mix @ mix.T)
+    said = as_held(S, share)
+    middle = slice(20, K - 20)  # beyond the last line there is more here than none
+    for i, j in ((0, 0), (0, 1), (1, 1)):
+        assert said[middle, i, j].real == pytest.approx(drawn[middle, i, j].real, rel=0.12)
+        assert said[middle, i, j].mean().real == pytest.approx(drawn[middle, i, j].mean().real, rel=0.03)
+    assert np.array_equal(as_held(S, None), S)
+
+
+def test_only_a_motor_that_rests_is_held():
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    group: Group = problem.groups[0]
+    pred = predict(model, group, problem.sampling)
+    still = held(pred, group)
+    assert not np.any(still & ~group.rest) and 0.2 < still[-1].mean() <= group.rest[-1].mean()
+    # Without a lag: the mean share of its power that is left.
+    assert held_share(pred, group)[0, 0, 0].real == pytest.approx(1.0 - (1.0 - LEFT_HELD**2) * still.mean())
+    assert held_share(predict(replace(model, effects=()), group, problem.sampling), group) is None
+    moving = replace(group, rest=np.zeros_like(group.rest))
+    assert held_share(predict(model, moving, problem.sampling), moving) is None
+
+
+@pytest.mark.parametrize("creep", [0.0, 3e-4])
+def test_a_motor_that_creeps_is_periodic_but_for_a_line(creep):
+    """A motor that slips by as much in each period, all at once: less the line, it repeats."""
+    rng, P, N = np.random.default_rng(5), 4, 1000
+    t = np.arange(P * N)
+    swing = np.tile(1e-3 * np.sin(2 * np.pi * 3 * np.arange(N) / N), P)
+    x = swing + creep * ((t + 400) // N) + 1e-6 * rng.normal(size=P * N)
+    y = without_creep(x.reshape(P, N, 1))
+    assert y.mean() == pytest.approx(x.mean(), abs=1e-9)
+    if not creep:
+        assert np.array_equal(y[..., 0].ravel(), x)
+    assert (y - y[:1]).mean(axis=(1, 2)) == pytest.approx(np.zeros(P), abs=0.01 * 3e-4)
+
+
+def test_what_is_held_hangs_on_few_parameters(monkeypatch):
+    """Columns beside dry friction, against differences: far nearer to these than those of a motor that nothing holds."""
+    problem, model = friction("coulomb_friction", [COULOMB, 0.1, 5e-3])
+    group = problem.groups[0]
+    pred = predict(model, group, problem.sampling)
+    x, off = pack(model), {}
+    J = jacobian(problem, model, group, pred).dense()
+    with monkeypatch.context() as without:
+        without.setattr("ident.torque_fit.held", lambda *_: None)
+        unaware = jacobian(problem, model, group, pred).dense()
+    for c in (0, 2, 3, len(model.par.to_log()) + 1):
+        ends = [predict(unpack(model, x + s * 1e-4 * (np.arange(len(x)) == c), np.inf), group, problem.sampling, W=pred.solution.W).U for s in (1, -1)]
+        slope = (ends[0] - ends[1])[-1, : J.shape[1]] / 2e-4
+        off[c] = [np.linalg.norm(X[-1, ..., c] - slope) / np.linalg.norm(slope) for X in (J, unaware)]
+    assert all(near < 0.5 for near, _ in off.values()) and off[len(model.par.to_log()) + 1][0] < 1e-3
+    assert all(aware < 0.7 * unaware for aware, unaware in (off[c] for c in (0, 2)))
