@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -82,10 +82,13 @@ def discrepancy_p_value(result: Fit) -> float:
     return float(scipy.stats.chi2.sf(result.cost, dof))
 
 
-def implausible(problem: Problem, result: Fit) -> bool:
+def implausible(problem: Problem, result: Fit, joints: Sequence[int] | None = None) -> bool:
     """Whether drives of a fit cannot be those of this arm: a stiffness or motor inertia far from its starting guess.
 
     They then stand for what is missing.
+
+    Args:
+        joints: whose drives are looked at; all where None.
     """
     n, x = problem.structure.n, result.model.par.to_log() - problem.nominal.to_log()
     drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
@@ -97,4 +100,5 @@ def implausible(problem: Problem, result: Fit) -> bool:
     if problem.motions_alone:
         known[:n] = False
         low &= known
-    return bool(np.any(low | (known & (x[drives] > limit))))
+    far = (low | (known & (x[drives] > limit))).reshape(2, n)
+    return bool(np.any(far if joints is None else far[:, list(joints)]))

@@ -18,12 +18,13 @@ from ident.channel_checks import (
 )
 from ident.dataset import CHANNELS, Dataset, Segment
 from ident.parallel import one_thread_each
+from ident.period_checks import period_warnings
 from ident.records import difference_noise
 from ident.skew_checks import skew_warnings
 from ident.torque_checks import torque_warnings
 from robot_assets.robot import linear_joints
 
-CHECKS = (filled_warnings, unit_warnings, stuck_warnings, lost_sample_warnings, skew_warnings, excitation_warnings, torque_warnings)
+CHECKS = (filled_warnings, period_warnings, unit_warnings, stuck_warnings, lost_sample_warnings, skew_warnings, excitation_warnings, torque_warnings)
 MOST = 40  # warnings shown
 SHOWN = 12  # segments listed one by one
 BRIEF = 5.0  # s of motion in all, below which inertia, gravity and friction hardly get apart

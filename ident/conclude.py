@@ -36,6 +36,7 @@ from ident.units import linear_names, parameter_unit, text_at, unit_at
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 AXIS_STEP = 1e-6  # of a tilt
+FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 
 
@@ -82,7 +83,8 @@ def conclude(
         or not named_effects(final)
     )
     causes = []
-    doubted = refuted or collapsed(problem, final)
+    few = final.count < FEWEST * len(final.names)
+    doubted = refuted or few or collapsed(problem, final)
     covariance = final.covariance()
     rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
     for effect in named_effects(final):
@@ -127,6 +129,7 @@ def conclude(
         residual_description=description,
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
+            *(few_note(final) if few and causes else ()),
             *faint_note(result),
             *(() if named_effects(final) else drift_note(problem)),
             *(belied_note(e) for e in named_effects(final) if e.hypothesis.key in belied),
@@ -193,6 +196,11 @@ def faint_note(result: Attribution) -> tuple[str, ...]:
         f"The model leaves {result.baseline.chi2_per_dof:.3g} times the power of the noise that was estimated: more than chance"
         f" (p = {result.p_value:.1g}), but up to {DETECTION_EXCESS:g} times may be an error of that estimate.",
     )
+
+
+def few_note(final: Fit) -> tuple[str, ...]:
+    """Why no name is trusted that is told by next to no data, in a sentence."""
+    return (f"{final.count} numbers were compared and {len(final.names)} parameters fitted to them: too few for any name to be sure.",)
 
 
 def drift_note(problem: Problem) -> tuple[str, ...]:

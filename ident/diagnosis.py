@@ -30,6 +30,7 @@ from ident.link_sensor import comparable_links, find_link_delays, with_link_enco
 from ident.next_experiment import separating_experiment
 from ident.noise import drifting, sample_noise, unexcited_noise
 from ident.parallel import Workers, one_thread_each
+from ident.period_checks import unrepeated
 from ident.quantization import Steps, find_steps
 from ident.records import Group, build_groups, difference_noise
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
@@ -249,7 +250,7 @@ def diagnose_fully(
     workers = Workers(executor, progress, time.monotonic() + max_seconds)
     say = workers.say
     given, dataset = dataset, with_held_out(dataset)
-    doubts = mislabelled(given)
+    doubts = [*unrepeated(given), *mislabelled(given)]
     if doubts:
         say("the recording looks mislabelled: no causes are sought")
         max_causes = 0

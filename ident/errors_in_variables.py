@@ -22,6 +22,7 @@ from ident.stiction import as_held
 
 MOST = 0.9  # of the information on any direction of the coordinates, that may be taken off as noise
 CERTAINLY_MORE = 1.5  # what noise adds over all that there is, in some direction, that no scatter of its estimate explains
+LEAST = 1e-12  # information on a coordinate that is none
 STEADY = 1e-10  # relative, of a normal matrix of which an inverse is taken
 
 
@@ -73,12 +74,14 @@ def scatter_information(group: Group, pred: Prediction, whiten: np.ndarray, base
 def trusted_share(information: np.ndarray, by_noise: np.ndarray) -> float:
     """Share of what noise adds that is taken off, 1 unless some direction of the coordinates would hold next to nothing then.
 
-    0 where there would be more noise in a direction than there is of all: then the periods differ by more than noise, as those of a
+    0 where some coordinate is not felt, and where there would be more noise in a direction than there is of all: then the periods differ by more than noise, as those of a
     motor that creeps do.
 
     Args:
         information: normal matrix (p, p); by_noise: what noise adds to its first rows and columns.
     """
+    if np.any(np.diag(information)[: len(by_noise)] < LEAST):  # of a motor that is held nothing is left to take noise off
+        return 0.0
     information, by_noise, _ = _scaled(information, by_noise)
     root = np.linalg.cholesky(information)
     largest = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, by_noise).T)).max()

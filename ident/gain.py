@@ -9,6 +9,7 @@ import numpy as np
 
 from ident.extended import Model, Prediction, predict
 from ident.records import Group
+from ident.stiction import as_held, held_share
 from ident.torque_fit import Problem, noise_covariance
 from ident.verdict import Gain, JointGain
 
@@ -57,7 +58,7 @@ def segment_errors(
         except FloatingPointError:
             continue
         pairs.append((a, b))
-        S = noise_covariance(problem, group, b)
+        S = as_held(noise_covariance(problem, group, b), held_share(b, group))
         share = group.window_share
         noise = share * np.einsum("kii->ki", S).real
         if by_line:

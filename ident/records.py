@@ -25,6 +25,7 @@ END_TIME = 0.1  # s, over which slope and curvature of an end are taken
 END_SAMPLES = 12  # at least
 REST_TIME, REST_SAMPLES = 0.05, 5  # s, and samples at least, within which a motor that stands still does not move
 REST_NOISE = 6.0  # beyond this many standard deviations of its noise
+SURE, CREEPING = 3.0, 0.02  # standard deviations of a velocity, and share of its rms, below which a motor may as well rest
 SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
 BORDER_SAMPLES = 8  # at either end of a period, from which it is told where it begins and ends
 CREEP = 6.0  # standard deviations of their noise, by which both must differ
@@ -422,7 +423,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
     link = None
     if segment.q_link is not None:
         link = _lines(close_motion(segment.q_link, n_return, fs, curvature=True)[None], n_lines)
-    return Group(
+    group = Group(
         operating_point=segment.operating_point or segment.name,
         segments=(segment.name,),
         U=U,
@@ -446,6 +447,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
         n_slow=n_slow,
         rest=_at_rest(segment.q, fs, REST_TIME)[None, np.minimum((time * fs).astype(int), len(segment.t) - 1)],
     )
+    return replace(group, rest=_lasting(group.rest & _slow(group), round(REST_TIME * fs * n_time / N)))
 
 
 def _at_rest(q: np.ndarray, fs: float, span: float) -> np.ndarray:
@@ -464,6 +466,23 @@ def _stillness(q: np.ndarray, count: int) -> np.ndarray:
     steps = np.abs(np.diff(q, axis=0))
     least = np.min(np.where(steps > 0, steps, np.inf), axis=0)
     return np.maximum(REST_NOISE * difference_noise(q) / np.sqrt(count), np.where(np.isfinite(least), 1.5 * least, 0.0))
+
+
+def _lasting(rest: np.ndarray, width: int) -> np.ndarray:
+    """Where a motor rests (S, n_time, n) for ``width`` points at least: in a turn the velocity says more than the torque."""
+    narrow = scipy.ndimage.minimum_filter1d(rest.astype(np.uint8), width, axis=1, mode="nearest")
+    return scipy.ndimage.maximum_filter1d(narrow, width, axis=1, mode="nearest", origin=-1 if width % 2 == 0 else 0) > 0
+
+
+def _slow(group: Group) -> np.ndarray:
+    """(S, n_time, n) where the velocity that laws see of a motion is no more than what it is off by, or little.
+
+    Positions may differ by no more than noise where a motor moves slowly, and its direction is known.
+    """
+    v = group.to_time(1j * group.omega[:, None] * group.signal_share * group.Q)
+    off = np.sqrt(2.0 * np.sum(group.omega[:, None] ** 2 * group.shown_error, axis=1, keepdims=True))
+    usual = np.sqrt(np.mean(v**2, axis=1, keepdims=True))
+    return np.abs(v) < np.maximum(SURE * off, CREEPING * usual)
 
 
 def _turning(group: Group) -> np.ndarray:

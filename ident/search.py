@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, HOPELESS, implausible
+from ident.baseline import DETECTION_EXCESS, DRIVE, HOPELESS, astray, implausible
 from ident.evidence import explained, last_is_pointless
 from ident.extended import Effect, Model, Prediction, along_record, as_loop, has_rough_law, is_along_record
 from ident.hypotheses import Hypothesis
@@ -41,6 +41,7 @@ STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under 
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
+RECOVERIES = 2  # at most, of gears gone astray beside one
 STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit ends: the winner is fitted to the end
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
@@ -430,7 +431,7 @@ def beside_strong(
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                return anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP)
+                return recovered(problem, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP))
         except NOT_COMPUTED:
             return None
 
@@ -446,7 +447,7 @@ def beside_strong(
         if any(h.key == key and settled(r) for h, r in pairs):
             break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
-    along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1])), key=lambda x: x[1].cost)
+    along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1], [x[0].joint])), key=lambda x: x[1].cost)
     told = workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
     right = [r for (_, r), (h, _) in zip(along[:FINALISTS], told, strict=True) if not is_along_record(h)]
     strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(problem, h.joint, r, right))]
@@ -461,6 +462,25 @@ def beside_strong(
         best.setdefault(h.key, (h, r))
     others = [(h, r) for h, r in ranked if h.key not in best]
     return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+
+
+def recovered(problem: Problem, result: Fit) -> Fit:
+    """A fit of a strong effect, gears that have gone astray on the way begun again from their guesses as long as that does better.
+
+    Where an effect is not yet of its size they take up what it leaves, and do not come back.
+    """
+    for _ in range(RECOVERIES):
+        lost = astray(problem, result)
+        if result.chi2_per_dof <= DETECTION_EXCESS or not np.any(lost):
+            return result
+        par, guess = result.model.par, problem.nominal
+        drives = {name: np.where(lost, getattr(guess, name), getattr(par, name)) for name in DRIVE}
+        model = replace(result.model, par=replace(par, **drives))
+        other = anneal(problem, model, ladder=ANNEALING[-2:], iterations=STRONG_STEPS, gap=STRONG_GAP, remainders=result.remainders)
+        if not other.cost < CLEARLY_BETTER * result.cost:
+            return result
+        result = other
+    return result
 
 
 def strong_effects(

@@ -42,7 +42,7 @@ from ident.noise import residual_covariance, white_covariance
 from ident.parallel import map_threads
 from ident.posture import moved_by_posture
 from ident.records import Group
-from ident.stiction import as_free, held, held_share
+from ident.stiction import as_free, as_held, held, held_share
 
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm
@@ -899,10 +899,26 @@ def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) 
     """
     costs = joint_costs(problem, preds, weights)
     if not problem.scatter_share or weights.by_noise is None or not has_scatter(problem, preds[0].model):
-        return costs
+        return costs + absorbed(problem, preds, weights)
     laws = [_of_laws(pred, group) for group, pred in zip(problem.groups, preds, strict=True)]
     more = noise_of(problem, preds, weights, laws) - weights.by_noise
     return np.maximum(costs - problem.scatter_share * more, 0.0)
+
+
+def absorbed(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """(n,) what noise would add to the costs at motors that dry friction holds, which takes it: no merit of the friction."""
+
+    def of_group(of: tuple[Group, Prediction, np.ndarray]) -> np.ndarray:
+        group, pred, whiten = of
+        share, n = held_share(pred, group), problem.structure.n
+        if share is None:
+            return np.zeros(whiten.shape[1])
+        noise = {"tau_std": problem.tau_std, "q_std": problem.q_std, "samples": problem.samples(group)}
+        S = residual_covariance(group, pred.sampled_impedance, **noise)
+        W = whiten[:, :, :n]
+        return _records(group) * np.einsum("kij,kjl,kil->i", W, S - as_held(S, share), W.conj(), optimize=True).real
+
+    return _by_joint(problem, map_threads(of_group, zip(problem.groups, preds, weights.whiten, strict=True)))
 
 
 def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:

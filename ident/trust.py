@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.attribute import UNTOLD, Attribution, Round
+from ident.attribute import MIN_EVIDENCE, UNTOLD, Attribution, Round
 from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
 from ident.faint import SHADOW
@@ -121,12 +121,20 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
 
 
 def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
-    """Whether the data tell the size of what makes an effect the one that it is named, to about a factor of ``e``."""
+    """Whether the data tell the size of what makes an effect the one that it is named, to about a factor of ``e``.
+
+    Where each parameter has a value at which the effect is none, all of them together must be further from there than chance
+    brings them (Wald 1943): a cause that has explained much while others were missing may be nothing beside these.
+    """
     h = effect.hypothesis
-    if "shown" not in h.options:
+    at = [final.names.index(h.coordinate(q.name)) for q in h.parameters]
+    if "shown" in h.options:
+        i = final.names.index(h.coordinate(h.options["shown"]))
+        return bool(covariance[i, i] < UNTOLD**2)
+    if any(q.null is None for q in h.parameters):
         return True
-    i = final.names.index(h.coordinate(h.options["shown"]))
-    return bool(covariance[i, i] < UNTOLD**2)
+    off = np.array([q.to_internal(v) - q.to_internal(q.null) for q, v in zip(h.parameters, effect.p, strict=True)])
+    return bool(off @ np.linalg.solve(covariance[np.ix_(at, at)], off) > MIN_EVIDENCE)
 
 
 def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect) -> bool:

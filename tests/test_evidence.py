@@ -761,10 +761,22 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
 def test_a_hysteresis_of_which_no_yielding_is_seen_is_not_trusted(named, std, trusted):
     """Without a limit that the data know it is a spring beside the gear's."""
     yields, rub = named["hysteresis", "elbow_joint"], named["coulomb_friction", "elbow_joint"]
-    names = tuple(f"hysteresis@elbow_joint:{q.name}" for q in yields.parameters)
-    final, covariance = SimpleNamespace(names=names), np.diag([1e-4, std**2, 2.0, 2.0])
+    names = tuple(h.coordinate(q.name) for h in (yields, rub) for q in h.parameters)
+    final, covariance = SimpleNamespace(names=names), np.diag([1e-4, std**2, 2.0, 2.0, 1e-4, 0.1, 2.0])
     assert shown(Effect(yields, np.array([1e4, 5.0, 5.0, 0.0])), final, covariance) == trusted
     assert shown(Effect(rub, np.array([5.0, 0.0, 1e-3])), final, covariance)
+
+
+@pytest.mark.parametrize(("off", "trusted"), [(0.5, False), (2.0, True)])
+def test_a_body_is_another_only_where_its_figures_together_say_so(named, off, trusted):
+    """Each of five figures at most two deviations from that of the model, two of which would go together by chance and do not."""
+    body = named["link_inertia", "forearm_link"]
+    std = np.array([0.02, 0.01, 0.01, 0.01, 0.05])
+    covariance = np.diag(std**2)
+    covariance[0, 4] = covariance[4, 0] = 0.9 * std[0] * std[4]
+    final = SimpleNamespace(names=[body.coordinate(q.name) for q in body.parameters])
+    p = np.array([np.exp(off * std[0]), off * std[1], off * std[2], off * std[3], np.exp(-off * std[4])])
+    assert shown(Effect(body, p), final, covariance) == trusted
 
 
 def test_what_is_no_chance_and_yet_no_discrepancy_is_said():
@@ -940,7 +952,7 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
     monkeypatch.setattr("ident.search.anneal", annealed)
     monkeypatch.setattr("ident.search.simulated", lambda problem, h, result: (h, result))
     monkeypatch.setattr("ident.search.under_own_noise", lambda problem, result: None)
-    monkeypatch.setattr("ident.search.implausible", lambda problem, result: False)
+    monkeypatch.setattr("ident.search.implausible", lambda *args: False)
     loud = replace(baseline, costs=10.0 * baseline.counts)
     beside_strong(setup.problem, loud, [(backlash, replace(loud, costs=5.0 * baseline.counts))], [], Workers())
     assert tried == joints

@@ -17,7 +17,7 @@ from ident.extended import Effect, Model, predict
 from ident.hypotheses import catalogue
 from ident.records import Group, build_groups, without_creep
 from ident.stiction import LEFT_HELD, as_held, held, held_share
-from ident.torque_fit import jacobian, noise_covariance, pack, residual, unpack
+from ident.torque_fit import data_counts, fair_costs, jacobian, joint_costs, make_weights, noise_covariance, pack, residual, unpack
 from robot_assets.robot import load_robot
 
 FS, PERIOD, PERIODS, STEPS = 1000.0, 2000, 3, 16
@@ -199,3 +199,26 @@ def test_what_is_held_hangs_on_few_parameters(monkeypatch):
         off[c] = [np.linalg.norm(X[-1, ..., c] - slope) / np.linalg.norm(slope) for X in (J, unaware)]
     assert all(near < 0.5 for near, _ in off.values()) and off[len(model.par.to_log()) + 1][0] < 1e-3
     assert all(aware < 0.7 * unaware for aware, unaware in (off[c] for c in (0, 2)))
+
+
+def test_noise_that_friction_takes_from_a_motor_at_rest_is_no_merit():
+    """Records of noise alone of a motor that stands still, where friction takes all of it: it costs as much as without."""
+    data, _ = sticking()
+    rng = np.random.default_rng(6)
+    still = [
+        replace(s, q=NOISE[0] * rng.normal(size=s.q.shape) + s.q0, tau=NOISE[1] * rng.normal(size=s.tau.shape))
+        for s in data.segments
+        if s.role == "identification"
+    ]
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    groups = build_groups(replace(data, segments=tuple(still)))
+    assert all(g.rest.mean() > 0.99 for g in groups)
+    for share in (0.0, 1.0):  # of the scatter between periods
+        p = replace(problem, groups=groups, scatter_share=share)
+        without = [predict(replace(model, effects=()), g, p.sampling) for g in groups]
+        held_by = [predict(model, g, p.sampling) for g in groups]
+        weights = make_weights(p, without, 0.0)
+        count = np.sum(data_counts(p))
+        assert np.sum(joint_costs(p, held_by, weights)) < 0.1 * count
+        fair = [np.sum(fair_costs(p, x, weights)) for x in (without, held_by)]
+        assert fair[1] == pytest.approx(fair[0], abs=0.15 * count)

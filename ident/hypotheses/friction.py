@@ -120,7 +120,7 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
         screen,
         "The residual torque of {joint} is a step in its velocity: a friction torque of {torque:.3g} N m"
         " against the motion whatever its speed.",
-        options={"dry": True, "size": lambda s: np.array([0.4 * s.torque, 0.0, 0.05 * s.v])},
+        options={"dry": True, "shown": "torque", "size": lambda s: np.array([0.4 * s.torque, 0.0, 0.05 * s.v])},
     )
 
 
@@ -168,6 +168,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "absorbs": "coulomb_friction",
             "absorb": absorb,
             "apart": "stribeck_velocity",
+            "shown": "static",
             "special": lambda p: np.array([p[0], 0.0, p[3]]),
             "dry": True,
             "trivial": lambda p, k: p[1] < 1.15 * p[0],
@@ -203,6 +204,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             "absorbs": "coulomb_friction",
             "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0], p[2]]),
             "apart": "stiffness",
+            "shown": "coulomb",
             "give": lambda p: p[1] / p[0],
             "trivial": lambda p, k: p[1] > MOST_GIVE * p[0],
             "special": lambda p: np.array([p[1], 0.0, SHARP]),
@@ -229,7 +231,7 @@ def load_dependent_friction(joint: int, place: str) -> Hypothesis:
         screen,
         "The friction torque of {joint} is {coefficient:.3g} of the torque it transmits: it differs"
         " between postures as the load does.",
-        options={"dry": True},
+        options={"dry": True, "shown": "coefficient"},
     )
 
 

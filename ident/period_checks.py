@@ -1,0 +1,45 @@
+"""Whether multisines repeat with the period that is said of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.dataset import Dataset, Segment
+from ident.records import difference_noise
+
+SEEN = 5.0  # rms of a channel over the noise of its samples, from which it can tell
+REPEATS = 0.5  # of what a channel does within a period, by which periods may differ
+
+
+def period_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """A period after which nothing repeats."""
+    if s.kind != "multisine" or s.steady_periods < 2:
+        return []
+    least = min(float(differing(s, channel).min()) for channel in ("q", "tau"))
+    if least < REPEATS or np.isinf(least):
+        return []
+    return [
+        f"nothing repeats with a period of {s.period} samples: from one to the next every signal differs by {least:.2g} times what"
+        " it does within a period, or more: another period, or no multisine?"
+    ]
+
+
+def differing(s: Segment, channel: str) -> np.ndarray:
+    """(n,) rms of what differs between periods over that of their mean; infinite where nothing but noise is seen.
+
+    Means of each period do not count: a motor may creep.
+    """
+    x = s.periodic(channel)
+    x = x - x.mean(axis=1, keepdims=True)
+    mean = x.mean(axis=0)
+    differ = np.sqrt(np.sum((x - mean) ** 2, axis=(0, 1)) / ((len(x) - 1) * x.shape[1]))
+    within = np.maximum(np.std(mean, axis=0), 1e-300)
+    seen = np.sqrt(np.mean(x**2, axis=(0, 1))) > SEEN * difference_noise(getattr(s, channel))
+    return np.where(seen, differ / within, np.inf)
+
+
+def unrepeated(dataset: Dataset) -> list[str]:
+    """What is surely wrong in the periods of a dataset: said of more than half of its multisines that have several."""
+    told = [(s.name, period_warnings(s, dataset)) for s in dataset.segments if s.kind == "multisine" and s.steady_periods > 1]
+    wrong = [f"{name}: {text}" for name, found in told for text in found]
+    return wrong[:1] if len(wrong) > 0.5 * len(told) else []
