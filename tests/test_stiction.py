@@ -17,7 +17,17 @@ from ident.extended import Effect, Model, predict
 from ident.hypotheses import catalogue
 from ident.records import Group, build_groups, without_creep
 from ident.stiction import LEFT_HELD, as_held, held, held_share
-from ident.torque_fit import data_counts, fair_costs, jacobian, joint_costs, make_weights, noise_covariance, pack, residual, unpack
+from ident.torque_fit import (
+    data_counts,
+    fair_costs,
+    jacobian,
+    joint_costs,
+    make_weights,
+    noise_covariance,
+    pack,
+    residual,
+    unpack,
+)
 from robot_assets.robot import load_robot
 
 FS, PERIOD, PERIODS, STEPS = 1000.0, 2000, 3, 16
