@@ -39,6 +39,7 @@ from ident.screening import Score, screen, signal_scale
 from ident.search import (
     FAINT,
     FINALISTS,
+    FIRST_STEPS,
     MIN_SHARE,
     POLISH_STEPS,
     RECORD_EXCESS,
@@ -72,6 +73,8 @@ LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 LAWS_LEAVE = 1e-4  # of what causes explain at a joint, left there by errors of a hundredth in their laws: no other is sought loudly
+RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
+SAME_PERIOD = 0.01  # relative, of two ripples
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
 
@@ -279,7 +282,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         return h.key not in there or (h.key == winner.key and loaded[0] != loaded[1])
 
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
-    rivals = [*rivals[:FINALISTS], *(wider(problem, current, own) if nearly_settled(current) else [])]
+    rivals = [*rivals[:FINALISTS], *(wider(problem, current, own) if nearly_settled(current) else []), *elsewhere(problem, current, own, others)]
 
     def entered(effect: Effect) -> Fit | None:
         model = replace(current.model, effects=(*others, effect))
@@ -290,6 +293,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     ran = [Candidate(e.hypothesis, r, 0.0) for e, r in zip(entrants, fits, strict=True) if r is not None]
     if len(ran) < 2 or ran[0].hypothesis is not own.hypothesis:
         return current, found
+    first = ran[0].fit
     best_of: dict[tuple[str, str], Candidate] = {}
     for c in sorted(ran, key=lambda c: c.fit.cost):
         best_of.setdefault(c.hypothesis.key, c)
@@ -299,7 +303,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     best = weighed[0]
     if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
         best = next(c for c in weighed if c.hypothesis.key == own.hypothesis.key)
-    elif best.hypothesis is not own.hypothesis:
+    elif best.fit is not first:
         current = polish(problem, best.fit)
     now = {c.hypothesis.key: c.probability for c in weighed}
     seen = {c.hypothesis.key for c in found.candidates}
@@ -307,6 +311,19 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
     known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
     return current, replace(found, candidates=tuple(known))
+
+
+def elsewhere(problem: Problem, current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:
+    """A ripple as it is screened beside all others: found beside causes that were missing its wave number may be another's."""
+    if RIPPLE not in [q.name for q in own.hypothesis.parameters]:
+        return []
+    without = refit(problem, replace(current.model, effects=tuple(others)), current.weights, current.remainders, FIRST_STEPS)
+    if without is None:
+        return []
+    preds = predictions(problem, without.model, without.remainders)
+    scores = screen(problem, without, preds, [own.hypothesis])
+    found = [Effect(own.hypothesis, clip_to_bounds(own.hypothesis, s.start)) for s in scores if s.start is not None]
+    return [e for e in found if abs(e.value(RIPPLE) / own.value(RIPPLE) - 1.0) > SAME_PERIOD]
 
 
 def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:

@@ -224,6 +224,13 @@ class Motion:
         left = given[..., joint] - linear - carried - others
         return self.group.to_time(left[..., None])[..., 0]
 
+    def asked_noise(self, joint: int) -> float:
+        """Standard deviation of ``asked`` by noise of the samples of motor position and torque, N m; in the mean over records."""
+        group, s = self.group, 1j * self.group.omega
+        gain = np.abs(s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) ** 2
+        power = np.sum(gain * group.white_noise[joint] + group.white_torque_noise[joint])
+        return float(np.sqrt(2.0 * power * np.mean(1.0 / group.periods)))
+
     @property
     def time(self) -> np.ndarray:
         """Time since the start of the recording, s."""

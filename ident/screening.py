@@ -414,35 +414,54 @@ def _refine(records: Sequence[_Record], center: float, width: float, count: int 
     spread = np.ptp([x.q.mean() for x in records]) + np.ptp(records[0].q)
     count_fine = int(np.clip(6 * width * spread, 41, 1500))
     first, step = center - 1.5 * width, 3.0 * width / (count_fine - 1)
-    q, r = _joined(records, center)
-    power = _coherent_power(q, r, first, step, count_fine)
+    parts = _seen(records, center)
+    power = _coherent_power(parts, first, step, count_fine)
     peaks = np.flatnonzero((power >= np.roll(power, 1)) & (power >= np.roll(power, -1)))
     out = []
     for k in peaks[np.argsort(-power[peaks])][:count]:
         nearest = first + (k - 1) * step
-        near = _coherent_power(q, r, nearest, step / 20, 41)
+        near = _coherent_power(parts, nearest, step / 20, 41)
         out.append(float(nearest + np.argmax(near) * step / 20))
     return out
 
 
-def _joined(records: Sequence[_Record], wave_number: float) -> tuple[np.ndarray, np.ndarray]:
-    """Motor angle and residual of all records where a wave lies in the compared band, some thousand samples."""
+def _seen(records: Sequence[_Record], wave_number: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Motor angle, what is known beforehand and residual of each record where a wave lies in the compared band; some thousand samples."""
     most = max(250, REFINED_SAMPLES // len(records))
-    q, r = [], []
+    out = []
     for x in records:
         seen = np.flatnonzero(x.speed * wave_number <= x.top)
         seen = seen[:: max(1, len(seen) // most)]
-        q.append(x.q[seen])
-        r.append(x.residual[seen])
-    return np.concatenate(q), np.concatenate(r)
+        if len(seen) > x.nuisance.shape[1]:
+            N = np.linalg.qr(x.nuisance[seen])[0]
+            r = x.residual[seen]
+            out.append((x.q[seen], N, r - N @ (N.T @ r)))
+    return out
 
 
-def _coherent_power(q: np.ndarray, r: np.ndarray, first: float, step: float, count: int) -> np.ndarray:
-    """Fall of the squared residual by a sine and a cosine of each wave number, one phase for all records."""
-    coarse, fine = (x.reshape(len(q), -1) for x in _waves(q, first, step, count))
-    square = ((coarse**2).T @ fine**2).ravel()[:count]
-    moment = ((coarse * r[:, None]).T @ fine).ravel()[:count]
-    return _fall(float(len(q)), square, moment, 1e-300)
+def _coherent_power(
+    parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], first: float, step: float, count: int
+) -> np.ndarray:
+    """Fall of the squared residual by a sine and a cosine of each wave number, one phase for all records.
+
+    Of each wave what is known of its record beforehand is left out: of less than a period that is most of it.
+    """
+    power, square, moment, samples = np.zeros(count), np.zeros(count, complex), np.zeros(count, complex), 0
+    for q, N, r in parts:
+        coarse, fine = (x.reshape(len(q), -1) for x in _waves(q, first, step, count))
+
+        def along(x: np.ndarray, coarse: np.ndarray = coarse, fine: np.ndarray = fine) -> np.ndarray:
+            return ((coarse * x[:, None]).T @ fine).ravel()[:count]
+
+        power += len(q)
+        square += ((coarse**2).T @ fine**2).ravel()[:count]
+        moment += along(r)
+        samples += len(q)
+        for known in N.T:
+            share = along(known)
+            power -= np.abs(share) ** 2
+            square -= share**2
+    return _fall(power, square, moment, 1e-9 * max(samples, 1) ** 2)
 
 
 def _waves(q: np.ndarray, first: float, step: float, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.attribute import MIN_EVIDENCE, UNTOLD, Attribution, Round
+from ident.attribute import MIN_EVIDENCE, RIPPLE, SAME_PERIOD, UNTOLD, Attribution, Round
 from ident.baseline import DETECTION_EXCESS, implausible
 from ident.extended import Effect, Prediction
 from ident.faint import SHADOW
@@ -33,8 +33,6 @@ CLOSED = 0.5  # share of the gap that the extended model must then close
 CARRIED = 0.8  # the same where it explains the data that it was fitted to down to the noise
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
 SHORT = 0.25  # by which the gap closed on held-out data may fall short of what the fitted ones promise
-RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
-SAME_PERIOD = 0.01  # relative, of two ripples
 FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band for its name to be trusted
 SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
 HARMONIC = 0.1  # the same of a ripple at a multiple of the periods of another one

@@ -232,3 +232,16 @@ def test_noise_that_friction_takes_from_a_motor_at_rest_is_no_merit():
         assert np.sum(joint_costs(p, held_by, weights)) < 0.1 * count
         fair = [np.sum(fair_costs(p, x, weights)) for x in (without, held_by)]
         assert fair[1] == pytest.approx(fair[0], abs=0.15 * count)
+
+
+def test_rest_tells_nothing_of_a_friction_within_the_noise_of_what_is_asked():
+    """Else the friction of a motor that hardly moves would explain the noise of its torque, whatever its size."""
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    group = problem.groups[0]
+    noise = predict(model, group, problem.sampling).motion(group).asked_noise(0)
+    assert NOISE[1] / 5 < noise < 0.2 * COULOMB
+    still = []
+    for size in (1.0, 6.0):
+        small = replace(model, effects=(replace(model.effects[0], p=np.array([size * noise, 0.0, 1e-4])),))
+        still.append(held(predict(small, group, problem.sampling), group).mean())
+    assert still[0] == 0.0 < still[1]

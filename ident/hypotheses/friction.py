@@ -14,6 +14,7 @@ from ident.inverse import Motion
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
 REST_QUANTILE = 0.95  # of what a friction balances at rest, that says its size
+SEEN = 3.0  # size of a friction over the noise of what is asked of it, below which rest tells nothing of it
 LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
@@ -44,7 +45,7 @@ def dry(
     """Dry friction (S, T), N m: its ``size`` in the direction of the motion; where the motor stands still what balances the drive.
 
     At rest dry friction is whatever the drive asks of it, up to its size (Coulomb 1785): no history of the velocity tells
-    it, and the recorded torque does.
+    it, and the recorded torque does, where it shows more than noise.
 
     Args:
         back: the size in the other direction; the same where None.
@@ -54,6 +55,9 @@ def dry(
     moving = np.where(s > 0, size, back) * s
     rest = resting(motion, j)
     if rest is None:
+        return moving
+    largest = np.broadcast_to(np.maximum(np.abs(size), np.abs(back)), rest.shape)[rest].mean()
+    if largest < SEEN * motion.asked_noise(j):
         return moving
     asked, least, most = motion.asked(j), -np.abs(back), np.abs(size)
     friction = np.where(rest, np.clip(asked, least, most), moving)
@@ -71,6 +75,8 @@ def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
     if rest is None:
         return direction(motion.v(j), smoothing)
     size = np.quantile(np.abs(motion.asked(j)[rest]), REST_QUANTILE)
+    if size < SEEN * motion.asked_noise(j):
+        return direction(motion.v(j), smoothing)
     return dry(motion, j, smoothing, size) / max(size, LEAST_TORQUE)
 
 
