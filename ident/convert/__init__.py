@@ -17,7 +17,7 @@ from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
 from ident.segment_file import LARGEST, SHORTEST
 from robot_assets.errors import DataError
-from robot_assets.robot import ASSETS, load_robot
+from robot_assets.robot import ASSETS, linear_joints, load_robot
 
 
 def convert_logs(
@@ -38,9 +38,11 @@ def convert_logs(
         DataError: for a log, map or robot that cannot be used.
     """
     arm = load_robot(robot)
-    log_map = read_map(map_path, arm.array("gear_ratio"))
+    log_map = read_map(map_path, arm.array("gear_ratio"), linear_joints(arm))
     segments: list[Segment] = []
-    for log_name, paths in _logs([Path(f) for f in files], log_map, str(map_path)):
+    logs = _logs([Path(f) for f in files], log_map, str(map_path))
+    _check_roles(logs, log_map, str(map_path))
+    for log_name, paths in logs:
         found = _segments(log_name, paths, log_map, arm.n, say)
         short = [s for s in found if s.n_samples < SHORTEST]
         if short:
@@ -87,6 +89,23 @@ def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str,
         (log,) = folders.values()
         return [(log[m.files[0].prefix].stem, log)]
     return [(folder.name or "log", log) for folder, log in folders.items()]
+
+
+def _called(name: str, path: Path) -> tuple[str, ...]:
+    """How [roles] may call a log."""
+    return name, path.stem, path.name
+
+
+def _check_roles(logs: list[tuple[str, dict[str, Path]]], m: LogMap, where: str) -> None:
+    """Raise a DataError where a role is that of no log: what was to be held out would be fitted to."""
+    names = {called for name, paths in logs for called in _called(name, next(iter(paths.values())))}
+    stray = sorted(set(m.roles) - names)
+    if stray and m.whole:
+        raise DataError("[roles]", where, f"{stray[0]}, which is none of the files given", f"one of {sorted(names)}")
+    for name, paths in logs:
+        own = {called: m.roles[called] for called in _called(name, next(iter(paths.values()))) if called in m.roles}
+        if len(set(own.values())) > 1:
+            raise DataError("[roles]", where, f"two roles of one log: {own}", "one")
 
 
 def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
@@ -171,7 +190,7 @@ def _cut(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np
 
 
 def _motions(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray]) -> list[Segment]:
-    role = next((m.roles[k] for k in (name, path.stem, path.name) if k in m.roles), None)
+    role = next((m.roles[k] for k in _called(name, path) if k in m.roles), None)
     if m.split is None or role is not None:
         return [Segment(name=name, kind="trajectory", role=role or "identification", t=t, **channels)]
     cut = int(m.split * len(t))
@@ -185,12 +204,12 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
     out: dict[str, np.ndarray] = {}
     length = None
     for c in m.columns:
-        x = _signal(data[c.source], c.source, c.index, path)
+        x = _signal(data[c.source], c.source, c.index, c.joint, path)
         if c.turn is not None:
             x = np.unwrap(x, period=c.turn)  # before the gear: a motor's encoder wraps once a turn of the motor
         x = x * c.factor + c.offset
         for source, factor, index in c.plus:
-            other = _signal(data[source], source, index, path)
+            other = _signal(data[source], source, index, c.joint, path)
             if len(other) != len(x):
                 raise DataError(source, str(path), f"{len(other)} samples", f"{len(x)} as in {c.source}")
             x = x + factor * other
@@ -212,14 +231,17 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
     return out
 
 
-def _signal(x: np.ndarray, name: str, index: int, path: Path) -> np.ndarray:
-    """One signal (N,) of a source; of two dimensions the longer is time."""
+def _signal(x: np.ndarray, name: str, index: int | None, joint: int, path: Path) -> np.ndarray:
+    """One signal (N,) of a source; of two dimensions the longer is time. Without an index it is the column of the joint."""
     if x.ndim > 2:
         raise DataError(name, str(path), f"{x.ndim} dimensions", "one or two")
     if x.ndim < 2 or min(x.shape) == 1:
+        if index:
+            raise DataError(name, str(path), f"index = {index}", "no index, or 0: it has one column")
         return x.ravel()
     if x.shape[0] < x.shape[1]:
         x = x.T
-    if index >= x.shape[1]:
-        raise DataError(name, str(path), f"{x.shape[1]} columns", f"column {index} (index counts from 0)")
-    return x[:, index]
+    column = joint if index is None else index
+    if column >= x.shape[1]:
+        raise DataError(name, str(path), f"{x.shape[1]} columns", f"column {column} (index counts from 0)")
+    return x[:, column]

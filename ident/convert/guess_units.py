@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.convert.mapping import UNITS
+from ident.convert.quantities import UNITS
 from robot_assets.robot import Robot
 
 NAMED_UNITS = {
