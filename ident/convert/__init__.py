@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
 from ident.convert.joining import on_one_clock
-from ident.convert.mapping import LogMap, read_map
+from ident.convert.mapping import Column, LogMap, read_map
 from ident.convert.reading import read_log
 from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
@@ -218,17 +218,23 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
         length = len(x)
         target = out.setdefault(c.channel, np.full((length, n), np.nan if c.channel == "q_link" else 0.0))
         target[:, c.joint] = x
-    for channel, x in out.items():
-        bad = ~np.isfinite(x) & ~(np.isnan(x) & (channel == "q_link"))
-        if np.any(bad):
-            k = int(np.flatnonzero(bad.any(axis=1))[0])
-            raise DataError(channel, str(path), f"a value that is not finite at sample {k}", "finite numbers")
-        if np.any(np.abs(x) > LARGEST):
-            k = int(np.flatnonzero((np.abs(x) > LARGEST).any(axis=1))[0])
-            raise DataError(channel, str(path), f"{np.nanmax(np.abs(x[k])):.3g} at sample {k}", f"at most {LARGEST:g} in SI units")
+        _check_values(x, c, path)
     if not length:
         raise DataError("signals", str(path), "no samples", "at least one")
     return out
+
+
+def _check_values(x: np.ndarray, c: Column, path: Path) -> None:
+    """Raise a DataError where a column (N,) of the dataset has a value that it cannot hold; a link encoder may have none."""
+    bad = np.flatnonzero(~np.isfinite(x) & ~(np.isnan(x) & (c.channel == "q_link")))
+    name = f"{c.channel}_{c.joint + 1}"
+    if len(bad):
+        kind = "NaN" if np.isnan(x[bad[0]]) else "infinity"
+        found = f"{kind} of {c.source} at sample {bad[0]} ({len(bad)} not finite in all)"
+        raise DataError(name, str(path), found, "finite numbers")
+    large = np.flatnonzero(np.abs(x) > LARGEST)
+    if len(large):
+        raise DataError(name, str(path), f"{x[large[0]]:.3g} of {c.source} at sample {large[0]}", f"at most {LARGEST:g} in SI units")
 
 
 def _signal(x: np.ndarray, name: str, index: int | None, joint: int, path: Path) -> np.ndarray:
