@@ -376,8 +376,10 @@ def _guess(files: list[Path], robot: str, out: Path, json_: bool) -> None:
         raise DataError("--map", str(out), str(err.strerror or err), "a file that can be written") from err
     rows = [f"first map in {out}; check it, above all the lines marked EDIT"]
     rows += [f"  {channel}: {what}" for channel, what in guessed.found.items()]
+    rows += [f"warning: {text}" for text in guessed.warnings]
     rows += [f"warning: nothing looks like {channel}: name it in the map" for channel in guessed.missing]
-    _print({"map": str(out), "found": guessed.found, "missing": list(guessed.missing)}, json_, "\n".join(rows))
+    result = {"map": str(out), "found": guessed.found, "missing": list(guessed.missing), "warnings": list(guessed.warnings)}
+    _print(result, json_, "\n".join(rows))
 
 
 @app.command()

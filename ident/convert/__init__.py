@@ -142,7 +142,13 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
         x = data[m.time].ravel()
         if len(x) != N:
             raise DataError(m.time, str(path), f"{len(x)} time stamps", f"one for each of {N} samples")
-        clock = check_stamps(stamp_seconds(x, m.time_factor, x[0]), m.sample_rate, path)
+        seconds = stamp_seconds(x, m.time_factor, x[0])
+        for source, factor in m.time_plus:
+            other = data[source].ravel()
+            if len(other) != N:
+                raise DataError(source, str(path), f"{len(other)} values", f"one for each of {N} samples")
+            seconds = seconds + stamp_seconds(other, factor, other[0])
+        clock = check_stamps(seconds, m.sample_rate, path)
         clocks, t = [clock], uniform_times(0.0, float(clock.t[-1]), m.sample_rate)
         if not at_times(clock, t, m.sample_rate):
             rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +14,8 @@ import numpy as np
 
 from ident.convert.guess_names import choose, families_of, oriented, score, words_of
 from ident.convert.guess_text import plain, render
-from ident.convert.guess_time import FileClock, find_time
-from ident.convert.guess_units import guess_scales, unwrapped
+from ident.convert.guess_time import FileClock, FoundTime, find_time
+from ident.convert.guess_units import Family, guess_scales, unwrapped
 from ident.convert.quantities import UNITS
 from ident.convert.reading import survey_log
 from ident.convert.spelling import split_unit, unit_of
@@ -34,15 +34,20 @@ class GuessedMap:
     Attributes:
         found: channel -> what was taken for it, in words.
         missing: required channels for which nothing was found: the map needs them.
+        warnings: why something that is in the log was not used, in words.
     """
 
     text: str
     found: dict[str, str]
     missing: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
-def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
+def guess_map(files: Sequence[Path], robot: str | Path, *, say: Callable[[str], None] = lambda text: None) -> GuessedMap:
     """Guess the map of one or more logs of a robot.
+
+    Args:
+        say: told in words what is being done.
 
     Raises:
         DataError: for a log or robot that cannot be read, or where no signal is long enough.
@@ -52,13 +57,19 @@ def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
     if not paths:
         raise DataError("files", "command line", "none", "at least one log")
     # Damaged values are no reason to guess nothing: the conversion names them.
-    surveys = [survey_log(p) for p in paths]
+    surveys = []
+    for path in paths:
+        say(f"reading {path.name}")
+        surveys.append(survey_log(path))
+    say("guessing the map")
     logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in s.signals.items()} for s in surveys]
     parts = _parts(paths, logs, arm.n)
     starts = [f"{prefix}:" for prefix in parts] or [""]
     units = {f"{p}{k}": u for p, s in zip(starts, surveys) for k, text in s.units.items() if (u := unit_of(text.strip("[](){}<> ")))}
     dates = {f"{p}{k}" for p, s in zip(starts, surveys) for k in s.dates}
-    clocks = _clocks(logs, starts, units, dates, arm) if parts else {}
+    damaged = {f"{p}{k}": int(bad[0]) + 1 for p, s in zip(starts, surveys) for k, x in s.signals.items() if len(bad := np.flatnonzero(~np.isfinite(x)))}
+    doubts = {f"{p}{k}": text for p, s in zip(starts, surveys) for k, text in s.doubts.items()}
+    clocks = _clocks(logs, starts, units, dates, damaged, arm) if parts else {}
     signals = _on_one_clock(logs, clocks) if clocks else _joined(logs, parts) if parts else logs[0]
     lengths = [_length(x) for x in signals.values() if _length(x) >= SHORTEST]
     if not lengths:
@@ -66,19 +77,28 @@ def guess_map(files: Sequence[Path], robot: str | Path) -> GuessedMap:
     # The log has the length at which most values stand.
     N = max(set(lengths), key=lambda k: sum(x.size for x in signals.values() if _length(x) == k))
     families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm)
-    time, rate, time_unit = find_time(families, signals, dates) if not clocks else (None, min(c.rate for c in clocks.values()), "")
-    chosen, others = choose([f for f in families if f.x.shape[1] == arm.n and f is not time and f.name not in dates], arm)
+    time = FoundTime(rate=min(c.rate for c in clocks.values())) if clocks else find_time(families, signals, dates, damaged, doubts)
+    chosen, others = choose([f for f in families if f.x.shape[1] == arm.n and f.name not in time.sources | dates], arm)
     if not {"tau", "q"} & set(chosen):
-        names = ", ".join(plain(f.name) for f in families if f is not time)
+        names = ", ".join(plain(f.name) for f in families if f.name not in time.sources)
         raise DataError("signals", str(paths[0]), f"nothing that looks like a position or a torque of {arm.n} joints: {names[:300] or 'none'}", "names or units that tell, or a map by hand")
     linear = linear_joints(arm)
     chosen = {c: unwrapped(f) if c in ("q", "q_ref", "q_link") and not np.any(linear) else f for c, f in chosen.items()}
-    scales = guess_scales(chosen, arm, linear, rate)
-    text = render(paths, arm, parts, clocks, time, time_unit, rate, chosen, others, scales, families, linear)
+    scales = guess_scales(chosen, arm, linear, time.rate)
+    text = render(paths, arm, parts, clocks, time, chosen, others, scales, families, linear, doubts)
     found = {c: f"{chosen[c].name}{', ' + ', '.join(s.options) if (s := scales[c]).options else ''}" for c in chosen}
-    if time is not None or clocks:
-        found["time"] = f"{time.name if time is not None else ', '.join(c.name for c in clocks.values())}, {rate:g} Hz"
-    return GuessedMap(text, found, tuple(c for c in ("tau", "q") if c not in chosen))
+    if time.source is not None or clocks:
+        found["time"] = f"{', '.join(c.name for c in clocks.values()) if clocks else ' + '.join((time.source or '', *(p[0] for p in time.plus)))}, {time.rate:g} Hz"
+        found["time"] += f"; {time.doubt}" if time.doubt else ""
+    warnings = [f"{name} {doubts[name]}: {expected}" for name, expected in _used(chosen, doubts)]
+    if time.lost is not None:
+        warnings.insert(0, f"no time: {time.lost[0]} {time.lost[2]}")
+    return GuessedMap(text, found, tuple(c for c in ("tau", "q") if c not in chosen), tuple(warnings))
+
+
+def _used(chosen: dict[str, Family], doubts: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Signals of the map that were read with a doubt."""
+    return [(name, "the conversion will name it") for f in chosen.values() for name, _ in f.sources if name in doubts]
 
 
 def _length(x: np.ndarray) -> int:
@@ -110,16 +130,17 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict
 
 
 def _clocks(
-    logs: list[dict[str, np.ndarray]], starts: list[str], units: dict[str, str], dates: set[str], arm: Robot
+    logs: list[dict[str, np.ndarray]], starts: list[str], units: dict[str, str], dates: set[str], damaged: Mapping[str, int], arm: Robot
 ) -> dict[str, FileClock]:
     """Prefix -> clock where each file has one of its own; else empty."""
     out = {}
     for log, start in zip(logs, starts, strict=True):
         own = {k: units[f"{start}{k}"] for k in log if f"{start}{k}" in units}
-        time, rate, unit = find_time(families_of(log, own, arm), log, {d.removeprefix(start) for d in dates if d.startswith(start)})
-        if time is None or rate is None:
+        own_dates, bad = {d.removeprefix(start) for d in dates if d.startswith(start)}, {k: damaged[f"{start}{k}"] for k in log if f"{start}{k}" in damaged}
+        time = find_time(families_of(log, own, arm), log, own_dates, bad, {})
+        if time.source is None or time.t is None or time.rate is None or time.plus:
             return {}
-        out[start] = FileClock(time.sources[0][0], rate, unit, time.x[:, 0] * UNITS[unit or "s"])
+        out[start] = FileClock(time.source, time.rate, time.unit, time.t * UNITS[time.unit or "s"])
     return out
 
 

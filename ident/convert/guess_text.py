@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import tomlkit
 
 from ident.convert.guess_names import CHANNELS
-from ident.convert.guess_time import FileClock
+from ident.convert.guess_time import FileClock, FoundTime
 from ident.convert.guess_units import Family, Scale, range_text
 from robot_assets.robot import Robot
 
@@ -21,19 +22,18 @@ def render(
     arm: Robot,
     parts: dict[str, tuple[Path, int | None]],
     clocks: dict[str, FileClock],
-    time: Family | None,
-    time_unit: str,
-    rate: float | None,
+    time: FoundTime,
     chosen: dict[str, Family],
     others: dict[str, list[Family]],
     scales: dict[str, Scale],
     families: list[Family],
     linear: np.ndarray,
+    doubts: Mapping[str, str],
 ) -> str:
     lines = [
         f"# First map of {plain(paths[0].name)} for the robot {plain(arm.name)}: guessed, so check every line,",
         "# above all those marked EDIT. Result: tau in N m (N), q in rad (m), both on the link side of the gear.",
-        f"sample_rate = {rate or 1000.0!r}" + ("" if rate else "        # EDIT: Hz; the log has no time column that was found"),
+        f"sample_rate = {time.rate or 1000.0!r}" + _rate_note(time, bool(clocks)),
         'input_hold = "none"      # "zoh" where the torque is held over a sample',
     ]
     if len(paths) == 1 or parts:
@@ -50,9 +50,15 @@ def render(
             lines.append(f"{quoted(prefix)} = {{ {', '.join(options)} }}")
         if clocks:
             lines.append("# Each has a time of its own: they are joined where all of them have samples.")
-    if time is not None:
-        lines += ["", "[time]", f"source = {quoted(time.sources[0][0])}"]
-        lines += [f'unit = "{time_unit}"'] if time_unit else ["# dates, which need no unit"]
+    if time.source is not None:
+        lines += ["", "[time]" + (f"                   # {plain(time.doubt)}" if time.doubt else ""), f"source = {quoted(time.source)}"]
+        lines += [f'unit = "{time.unit}"'] if time.unit else ["# dates, which need no unit"]
+        if time.plus:
+            lines.append("plus = [" + ", ".join(f'{{ source = {quoted(s)}, unit = "{u}" }}' for s, u in time.plus) + "]")
+    elif time.lost is not None:
+        name, unit, why = time.lost
+        lines += ["", f"# EDIT: {plain(name)} is not used as the time: it {why}.", "# Mend the log, or leave it out: the samples then count as even.", "# [time]", f"# source = {quoted(name)}"]
+        lines += [f'# unit = "{unit}"'] if unit else []
     lines += ["", "[columns]"]
     for channel in CHANNELS:
         if channel not in chosen:
@@ -63,7 +69,8 @@ def render(
                 lines += [f'# {channel}_{j + 1} = {{ source = "...", unit = "{unit[int(linear[j])]}" }}' for j in range(arm.n)]
             continue
         family, scale = chosen[channel], scales[channel]
-        notes = "; ".join(note for note in (family.note, scale.note) if note)
+        damaged = (f"EDIT: {plain(name)} has {plain(doubts[name])}" for name, _ in dict(family.sources).items() if name in doubts)
+        notes = "; ".join(note for note in (family.note, scale.note, *damaged) if note)
         lines += ["", f"# {channel}: {notes}" if notes else f"# {channel}"]
         if others[channel]:
             lines.append("# might also be: " + ", ".join(plain(f.name) for f in others[channel]))
@@ -86,10 +93,18 @@ def render(
             "# [[multisine.part]]", "# first = 2                # the first period has the transient", f"# last = {max(2, N // period)}",
             '# role = "identification"',
         ]  # fmt: skip
-    unused = [f for f in families if f is not time and f.name not in {c.name for c in chosen.values()}]
+    unused = [f for f in families if f.name not in time.sources and f.name not in {c.name for c in chosen.values()}]
     if unused:
         lines += ["", "# Not used:"] + [f"#   {plain(f.name)}: {range_text(f.x)}" for f in unused[:60]]
     return "\n".join(lines) + "\n"
+
+
+def _rate_note(time: FoundTime, joined: bool) -> str:
+    if time.source is not None or joined:
+        return f"        # {plain(time.doubt)}" if time.doubt.startswith("EDIT") else ""
+    if time.lost is not None and time.rate is not None:
+        return f"        # EDIT: Hz, by the median step of {plain(time.lost[0])}, which is not used as the time"
+    return "" if time.rate is not None else "        # EDIT: Hz; the log has no time column that was found"
 
 
 def period_of(chosen: dict[str, Family]) -> int | None:

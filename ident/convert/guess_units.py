@@ -17,7 +17,10 @@ from robot_assets.robot import Robot
 NAMED_UNITS = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "rad": "rad", "radians": "rad", "mrad": "mrad", "rpm": "rpm", "mm": "mm",
     "nm": "N m", "mnm": "mN m", "knm": "kN m", "ma": "mA", "amp": "A", "amps": "A", "volt": "V", "voltage": "V",
-    "ns": "ns", "us": "us", "usec": "us", "ms": "ms", "msec": "ms", "s": "s", "sec": "s",
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecs", "nanosecond", "nanoseconds"), "ns"),
+    **dict.fromkeys(("us", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
 }  # fmt: skip
 TURNS = {"rad": 2 * np.pi, "deg": 360.0, "mrad": 2e3 * np.pi, "rev": 1.0}  # a full turn, in the units that logs wrap in
 NEAR = 0.25  # of a turn, between two samples: a joint that is faster hides where it wraps

@@ -19,7 +19,8 @@ COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
 OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap", "plus"}
 KEYS = {"sample_rate", "input_hold", "time", "files", "columns", "multisine", "roles", "split"}
 PLUS_KEYS = {"source", "factor", "index"}
-TIME_KEYS = {"source", "unit"}
+TIME_KEYS = {"source", "unit", "plus"}
+TIME_PLUS_KEYS = {"source", "unit"}
 FILE_KEYS = {"name", "width", "time", "unit", "shift"}
 MULTISINE_KEYS = {"period", "operating_point", "excited_from", "excited_threshold", "excited_lines", "part"}
 PART_KEYS = {"first", "last", "role"}
@@ -88,6 +89,7 @@ class LogMap:
 
     Attributes:
         sample_rate: Hz, of the dataset. time_factor: s per unit of the time column.
+        time_plus: (source, s per unit) of what is added to it: full seconds with their fraction beside them.
         files: where a log is spread over several; else empty.
         roles: file name or its stem -> role; whole: whether each must be of a file given. split: share of a file without a role that is for
             identification, the rest validates.
@@ -108,12 +110,14 @@ class LogMap:
     roles: dict[str, str]
     split: float | None
     whole: bool = True
+    time_plus: tuple[tuple[str, float], ...] = ()
 
     @property
     def sources(self) -> set[str]:
         """Names of all signals that the map reads."""
         out = {s for c in self.columns for s in c.sources}
         out |= {f"{f.prefix}:{f.time}" for f in self.files if f.time is not None}
+        out |= {s for s, _ in self.time_plus}
         return out | {s for s in (self.time, self.excited_from) if s is not None}
 
 
@@ -169,7 +173,10 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
     files = tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items())
     source = text(time, "source", f"{where} time") if "time" in data else None
     factor = unit_factor(time.get("unit", "s"), TIMES, "time", where)
-    if files and source is not None and not any(source.startswith(f"{f.prefix}:") for f in files):
+    time_plus = tuple(_time_plus(p, where) for p in tables(time, "plus", f"{where} time"))
+    if time_plus and any(f.time for f in files):
+        raise DataError("time.plus", where, "a time of each of [files] as well", "one time for all of them")
+    if files and source is not None and not time_plus and not any(source.startswith(f"{f.prefix}:") for f in files):
         # A column of every file: each has a clock of its own.
         files, source = tuple(f if f.time else replace(f, time=source, time_factor=factor) for f in files), None
     clocks = [f.time is not None for f in files]
@@ -192,6 +199,7 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
         roles={k: choice(roles, k, where, ROLES) for k in roles},
         split=number(data, "split", where, low=0.05, high=0.95) if "split" in data else None,
         whole=not shipped,  # of published logs any may be at hand
+        time_plus=time_plus,
     )
 
 
@@ -200,6 +208,11 @@ def _known(table: dict, keys: set[str], start: str, where: str) -> None:
     stray = set(table) - keys
     if stray:
         raise DataError(f"{start}{min(stray)}", where, "an unknown key", f"one of {sorted(keys)}")
+
+
+def _time_plus(entry: dict, where: str) -> tuple[str, float]:
+    _known(entry, TIME_PLUS_KEYS, "time.plus.", where)
+    return text(entry, "source", f"{where} time.plus"), unit_factor(entry.get("unit", "s"), TIMES, "time.plus", where)
 
 
 def _part(entry: dict, where: str) -> Part:

@@ -80,7 +80,8 @@ def survey_log(path: Path) -> Survey:
             continue
         if x.dtype.kind in "Mm":
             dates.add(name)
-            x = seconds(x, x.ravel()[0]) if x.size else x
+            stamps = x.ravel()[~np.isnat(x.ravel())]
+            x = seconds(x, stamps[0]) if len(stamps) else np.zeros(0)
         signals[name] = x.astype(float)
     return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts)
 
