@@ -1,5 +1,6 @@
 """Maps of logs: what they misspell, or say of a quantity that it cannot be, is one clear line."""
 
+import shutil
 import tomllib
 
 import numpy as np
@@ -7,8 +8,10 @@ import pytest
 
 from ident.convert import convert_logs
 from ident.convert.guess import guess_map
+from ident.dataset_io import load_dataset, save_dataset
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import write_robot
+from robot_assets.robot import load_robot
 
 N = 200
 T = np.arange(N) / 100.0
@@ -29,7 +32,7 @@ def written(folder, name="log.csv", **columns):
 
 
 def mapped(folder, text):
-    (folder / "map.toml").write_text(text)
+    (folder / "map.toml").write_text(text, encoding="utf-8")
     return folder / "map.toml"
 
 
@@ -110,3 +113,13 @@ def test_an_arm_of_both_kinds_of_joints_has_units_of_both(tmp_path):
             convert_logs([log], tmp_path / "arm", mapped(tmp_path, wrong))
     geared = text.replace('"q2", unit = "m"', '"q2", unit = "rad", side = "motor"')
     convert_logs([log], tmp_path / "arm", mapped(tmp_path, geared))
+
+
+def test_a_byte_order_mark_before_a_file_is_no_fault(tmp_path):
+    log, folder = written(tmp_path), tmp_path / "arm"
+    shutil.copytree(load_robot("twomass").folder, folder)
+    data = convert_logs([log], folder, mapped(tmp_path, "\ufeff" + TURNING))
+    save_dataset(data, tmp_path / "d")
+    for toml in (folder / "robot.toml", tmp_path / "d" / "dataset.toml"):
+        toml.write_text("\ufeff" + toml.read_text(encoding="utf-8"), encoding="utf-8")
+    assert load_dataset(tmp_path / "d").robot.folder == folder.resolve()
