@@ -6,7 +6,9 @@ import sys
 import numpy as np
 import pytest
 
+from ident.cli import main
 from ident.convert import convert_logs
+from ident.convert.guess import guess_map
 from ident.convert.reading import list_signals, read_log, survey_log
 from robot_assets.errors import DataError
 
@@ -129,3 +131,25 @@ def test_texts_that_are_no_numbers_take_no_memory(tmp_path, command):
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     error, grown = run.stdout.strip().splitlines()
     assert "log.csv" in error and int(grown) < 20_000, run.stdout  # KB, of a file of 12 MB
+
+
+def test_the_beginning_of_a_long_log_is_enough_for_a_guess(tmp_path, monkeypatch):
+    monkeypatch.setattr("ident.convert.texts.MOST_CELLS", 100_000)
+    monkeypatch.setattr("ident.convert.reading.MOST_CELLS", 100_000)
+    row = ["0.12345678,0.87654321", "0.2,0.1"]
+    log = written(tmp_path, row * 100_000, "torque_Nm,pos_rad")
+    survey = survey_log(log)
+    assert 50_000 < survey.cut < 150_000 and len(survey.signals["pos_rad"]) == survey.cut
+    assert guess_map([log], "twomass").warnings[-1] == f"log.csv: guessed from its first {survey.cut} rows"
+    assert len(read_log(log, {"pos_rad"})["pos_rad"]) == 200_000
+
+
+@pytest.mark.parametrize("quiet", [(), ("--quiet",), ("--json",)])
+def test_a_large_log_has_progress(tmp_path, monkeypatch, capfd, quiet):
+    (tmp_path / "map.toml").write_text(MAP)
+    args = ["simgap", "convert", str(written(tmp_path, rows())), "--robot", "twomass", "--map", str(tmp_path / "map.toml"), "--out", str(tmp_path / "d"), *quiet]
+    for size, told in ((1e3, not quiet), (1e9, False)):
+        monkeypatch.setattr("ident.cli.LARGE_LOG", size)
+        monkeypatch.setattr(sys, "argv", args)
+        main()
+        assert capfd.readouterr().err.splitlines() == (["reading log.csv", f"writing {tmp_path / 'd'}"] if told else [])

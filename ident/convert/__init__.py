@@ -27,12 +27,13 @@ def convert_logs(
     *,
     name: str = "log",
     say: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> Dataset:
     """Read logs by a map; each log gives one segment, one for each part of a multisine, or two by a split.
 
     Args:
         files: one log each, or by ``[files]`` of the map several a log (those of one folder).
-        say: told in words what was changed on the way (resampling, gaps).
+        say: told in words what was changed on the way (resampling, gaps). progress: what is being done.
 
     Raises:
         DataError: for a log, map or robot that cannot be used.
@@ -43,6 +44,7 @@ def convert_logs(
     logs = _logs([Path(f) for f in files], log_map, str(map_path))
     _check_roles(logs, log_map, str(map_path))
     for log_name, paths in logs:
+        progress(f"reading {', '.join(p.name for p in paths.values())}")
         found = _segments(log_name, paths, log_map, arm.n, say)
         short = [s for s in found if s.n_samples < SHORTEST]
         if short:

@@ -43,11 +43,11 @@ class GuessedMap:
     warnings: tuple[str, ...] = ()
 
 
-def guess_map(files: Sequence[Path], robot: str | Path, *, say: Callable[[str], None] = lambda text: None) -> GuessedMap:
+def guess_map(files: Sequence[Path], robot: str | Path, *, progress: Callable[[str], None] = lambda text: None) -> GuessedMap:
     """Guess the map of one or more logs of a robot.
 
     Args:
-        say: told in words what is being done.
+        progress: told in words what is being done.
 
     Raises:
         DataError: for a log or robot that cannot be read, or where no signal is long enough.
@@ -59,9 +59,9 @@ def guess_map(files: Sequence[Path], robot: str | Path, *, say: Callable[[str], 
     # Damaged values are no reason to guess nothing: the conversion names them.
     surveys = []
     for path in paths:
-        say(f"reading {path.name}")
+        progress(f"reading {path.name}")
         surveys.append(survey_log(path))
-    say("guessing the map")
+    progress("guessing the map")
     logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in s.signals.items()} for s in surveys]
     parts = _parts(paths, logs, arm.n)
     starts = [f"{prefix}:" for prefix in parts] or [""]
@@ -91,6 +91,7 @@ def guess_map(files: Sequence[Path], robot: str | Path, *, say: Callable[[str], 
         found["time"] = f"{', '.join(c.name for c in clocks.values()) if clocks else ' + '.join((time.source or '', *(p[0] for p in time.plus)))}, {time.rate:g} Hz"
         found["time"] += f"; {time.doubt}" if time.doubt else ""
     warnings = [f"{name} {doubts[name]}: {expected}" for name, expected in _used(chosen, doubts)]
+    warnings += [f"{p.name}: guessed from its first {s.cut} rows" for p, s in zip(paths, surveys) if s.cut]
     if time.lost is not None:
         warnings.insert(0, f"no time: {time.lost[0]} {time.lost[2]}")
     return GuessedMap(text, found, tuple(c for c in ("tau", "q") if c not in chosen), tuple(warnings))

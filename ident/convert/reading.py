@@ -14,7 +14,7 @@ import pyarrow.parquet
 
 from ident.convert.dates import as_dates, dates_of_texts, seconds
 from ident.convert.layout import read_layout
-from ident.convert.texts import distinct, read_text, scan_text, text_names, text_units
+from ident.convert.texts import MOST_CELLS, distinct, read_text, scan_text, text_names, text_units
 from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
@@ -35,12 +35,14 @@ class Survey:
         units: name -> unit as the log writes it, where it does.
         dates: names of those that are dates or times of the day.
         doubts: name -> what is doubtful about how it was read, in words; of those left out as well.
+        cut: rows that were read of a log that is longer; else 0.
     """
 
     signals: Signals
     units: dict[str, str]
     dates: frozenset[str]
     doubts: dict[str, str]
+    cut: int = 0
 
 
 def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Signals:
@@ -73,8 +75,9 @@ def survey_log(path: Path) -> Survey:
     """
     signals: Signals = {}
     dates, doubts = set(), {}
+    rows = [0]
     text = READERS.get(path.suffix.lower()) is read_text
-    for name, value in (_read(path, None, lambda p, _: _surveyed(p, doubts)) if text else _read(path, None)).items():
+    for name, value in (_read(path, None, lambda p, _: _surveyed(p, doubts, rows)) if text else _read(path, None)).items():
         x = _array(value)
         if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
@@ -83,14 +86,16 @@ def survey_log(path: Path) -> Survey:
             stamps = x.ravel()[~np.isnat(x.ravel())]
             x = seconds(x, stamps[0]) if len(stamps) else np.zeros(0)
         signals[name] = x.astype(float)
-    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts)
+    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0])
 
 
-def _surveyed(path: Path, doubts: dict[str, str]) -> dict[str, Any]:
-    """Signals of a text, and what is doubtful about them."""
+def _surveyed(path: Path, doubts: dict[str, str], rows: list[int]) -> dict[str, Any]:
+    """Signals of a text, and what is doubtful about them; rows read of one that is longer."""
     if not read_layout(path).names:
         return read_text(path, None)
     cells = scan_text(path, None)
+    if cells and cells[0].rows * len(cells) > MOST_CELLS:
+        rows[0] = cells[0].rows
     for c in cells:
         if c.fault is not None:
             doubts[c.name] = f"{c.fault[1][:40]!r} in row {c.fault[0]}"
