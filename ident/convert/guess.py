@@ -15,7 +15,7 @@ import numpy as np
 from ident.convert.guess_names import choose, families_of, oriented, score, words_of
 from ident.convert.guess_text import plain, render
 from ident.convert.guess_time import FileClock, FoundTime, find_time
-from ident.convert.guess_units import Family, guess_scales, unwrapped
+from ident.convert.guess_units import guess_scales, unwrapped
 from ident.convert.quantities import UNITS
 from ident.convert.reading import survey_log
 from ident.convert.spelling import split_unit, unit_of
@@ -63,13 +63,14 @@ def guess_map(files: Sequence[Path], robot: str | Path, *, progress: Callable[[s
         surveys.append(survey_log(path))
     progress("guessing the map")
     logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in s.signals.items()} for s in surveys]
-    parts = _parts(paths, logs, arm.n)
+    parts = _parts(paths, logs, arm)
     starts = [f"{prefix}:" for prefix in parts] or [""]
     units = {f"{p}{k}": u for p, s in zip(starts, surveys) for k, text in s.units.items() if (u := unit_of(text.strip("[](){}<> ")))}
     dates = {f"{p}{k}" for p, s in zip(starts, surveys) for k in s.dates}
     damaged = {f"{p}{k}": int(bad[0]) + 1 for p, s in zip(starts, surveys) for k, x in s.signals.items() if len(bad := np.flatnonzero(~np.isfinite(x)))}
     doubts = {f"{p}{k}": text for p, s in zip(starts, surveys) for k, text in s.doubts.items()}
-    clocks = _clocks(logs, starts, units, dates, damaged, arm) if parts else {}
+    warnings = [f"{p.name}: guessed from its first {s.cut} rows" for p, s in zip(paths, surveys) if s.cut]
+    clocks = _clocks(logs, starts, units, dates, damaged, arm, warnings) if parts else {}
     signals = _on_one_clock(logs, clocks) if clocks else _joined(logs, parts) if parts else logs[0]
     lengths = [_length(x) for x in signals.values() if _length(x) >= SHORTEST]
     if not lengths:
@@ -90,16 +91,10 @@ def guess_map(files: Sequence[Path], robot: str | Path, *, progress: Callable[[s
     if time.source is not None or clocks:
         found["time"] = f"{', '.join(c.name for c in clocks.values()) if clocks else ' + '.join((time.source or '', *(p[0] for p in time.plus)))}, {time.rate:g} Hz"
         found["time"] += f"; {time.doubt}" if time.doubt else ""
-    warnings = [f"{name} {doubts[name]}: {expected}" for name, expected in _used(chosen, doubts)]
-    warnings += [f"{p.name}: guessed from its first {s.cut} rows" for p, s in zip(paths, surveys) if s.cut]
+    warnings += [f"{name} {doubts[name]}: the conversion will name it" for f in chosen.values() for name, _ in f.sources if name in doubts]
     if time.lost is not None:
         warnings.insert(0, f"no time: {time.lost[0]} {time.lost[2]}")
     return GuessedMap(text, found, tuple(c for c in ("tau", "q") if c not in chosen), tuple(warnings))
-
-
-def _used(chosen: dict[str, Family], doubts: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Signals of the map that were read with a doubt."""
-    return [(name, "the conversion will name it") for f in chosen.values() for name, _ in f.sources if name in doubts]
 
 
 def _length(x: np.ndarray) -> int:
@@ -109,8 +104,9 @@ def _length(x: np.ndarray) -> int:
 # --- files of one log, or a log each
 
 
-def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict[str, tuple[Path, int | None]]:
+def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], arm: Robot) -> dict[str, tuple[Path, int | None]]:
     """Prefix -> (file, width) where the files are parts of one log; empty where each is a log."""
+    n = arm.n
     if len(paths) == 1:
         x = logs[0].get(VALUES)
         if x is None or x.shape[1] > 1 or n == 1 or x.size % n:
@@ -119,7 +115,7 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict
     told = [split_unit(name) for name in logs[0]]
     scores = [score(words_of(stem), channel, unit) for stem, unit in told for channel in ("tau", "q")]
     both = all(any(score(words_of(stem), c, unit) > 0 for stem, unit in told) for c in ("tau", "q"))
-    if scores and both:
+    if scores and both and not _a_joint_each(logs, arm):
         return {}
     shortest = min((_length(x) for log in logs for x in log.values() if _length(x) >= SHORTEST), default=0)
     out: dict[str, tuple[Path, int | None]] = {}
@@ -130,16 +126,31 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], n: int) -> dict
     return out
 
 
+def _a_joint_each(logs: list[dict[str, np.ndarray]], arm: Robot) -> bool:
+    """Whether files that have position and torque are of a joint each: as many as joints, alike, and none has columns of all."""
+    if len(logs) != arm.n or arm.n == 1 or any(set(log) != set(logs[0]) for log in logs):
+        return False
+    return all(f.x.shape[1] == 1 for f in families_of({k: x for k, x in logs[0].items() if _length(x) >= SHORTEST}, {}, arm))
+
+
 def _clocks(
-    logs: list[dict[str, np.ndarray]], starts: list[str], units: dict[str, str], dates: set[str], damaged: Mapping[str, int], arm: Robot
+    logs: list[dict[str, np.ndarray]],
+    starts: list[str],
+    units: dict[str, str],
+    dates: set[str],
+    damaged: Mapping[str, int],
+    arm: Robot,
+    warnings: list[str],
 ) -> dict[str, FileClock]:
-    """Prefix -> clock where each file has one of its own; else empty."""
+    """Prefix -> clock where each file has one of its own; else empty, and ``warnings`` say of one that cannot be used."""
     out = {}
     for log, start in zip(logs, starts, strict=True):
         own = {k: units[f"{start}{k}"] for k in log if f"{start}{k}" in units}
         own_dates, bad = {d.removeprefix(start) for d in dates if d.startswith(start)}, {k: damaged[f"{start}{k}"] for k in log if f"{start}{k}" in damaged}
         time = find_time(families_of(log, own, arm), log, own_dates, bad, {})
         if time.source is None or time.t is None or time.rate is None or time.plus:
+            if time.lost is not None:
+                warnings.append(f"no time: {start}{time.lost[0]} {time.lost[2]}")
             return {}
         out[start] = FileClock(time.source, time.rate, time.unit, time.t * UNITS[time.unit or "s"])
     return out

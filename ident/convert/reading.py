@@ -121,6 +121,8 @@ def _array(value: Any) -> np.ndarray | None:
 def _instead(x: np.ndarray | None) -> str:
     """What stands there, in words, where that can be told."""
     kind = "" if x is None else x.dtype.kind
+    if kind == "O" and x is not None and x.size == 1 and x.item() is None:  # as ``_lists`` gives them
+        return " but of lists of several lengths"
     return {"b": " but of true and false", "M": " but of dates", "m": " but of times", "U": " but of texts"}.get(kind, "")
 
 

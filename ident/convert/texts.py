@@ -21,6 +21,7 @@ MOST_CELLS = 8_000_000  # that a survey looks at: minutes of a log, and a bounde
 PIECE = 1 << 20  # characters read at a time
 SIGNS = "#% \t"  # before a header that is a comment
 BLANKS = str.maketrans("\t\f\v", "   ")
+UNEVEN = re.compile(r"(?:Row #(\d+): )?Expected (\d+) columns, got (\d+): (.*)", re.DOTALL)
 COMMENT = re.compile(r"[#%].*")
 
 
@@ -93,37 +94,49 @@ def _table(columns: dict[str, np.ndarray], layout: Layout) -> dict[str, np.ndarr
 
 
 def _batches(path: Path, layout: Layout, keep: list[int]) -> Iterator[pa.RecordBatch]:
-    """Cells as texts: what a column holds is seen when it is read, not by its first rows."""
-    columns = [str(i) for i in range(layout.columns)]
-    uneven: list[pa.csv.InvalidRow] = []
+    """Cells as texts: what a column holds is seen when it is read, not by its first rows.
 
-    def refuse(row: pa.csv.InvalidRow) -> str:
-        uneven.append(row)
-        return "error"
+    Piece by piece, and in this thread: one of Arrow's that still reads a Python object when all ends would abort.
+    """
+    options = {
+        "parse_options": pa.csv.ParseOptions(delimiter=layout.delimiter or " "),
+        "convert_options": pa.csv.ConvertOptions(
+            include_columns=[str(i) for i in keep], column_types={str(i): pa.string() for i in keep}, strings_can_be_null=True
+        ),
+    }
+    names = [str(i) for i in range(layout.columns)]
+    for line, piece in _pieces(path, layout):
+        read = pa.csv.ReadOptions(column_names=names, block_size=len(piece) + 1, use_threads=False)
+        try:
+            table = pa.csv.read_csv(pa.BufferReader(piece), read_options=read, **options)
+        except pa.ArrowInvalid as err:
+            uneven = UNEVEN.search(str(err))
+            if uneven is None:
+                raise
+            at = f" in line {line + int(uneven[1])}" if uneven[1] else ""
+            raise DataError("row", str(path), f"{uneven[3]} columns{at}: {uneven[4][:60]!r}", f"{uneven[2]} as in the rows above") from err
+        yield from table.to_batches()
 
-    blanks = layout.delimiter is None or not layout.names
-    encoding = "utf8" if blanks or layout.encoding == "utf-8-sig" else layout.encoding
-    source: Any = pa.PythonFile(_Blanks(path, layout), mode="r") if blanks else path
-    try:
-        with pa.csv.open_csv(
-            source,
-            read_options=pa.csv.ReadOptions(encoding=encoding, column_names=columns, skip_rows=0 if blanks else layout.start),
-            parse_options=pa.csv.ParseOptions(delimiter=layout.delimiter or " ", invalid_row_handler=refuse),
-            convert_options=pa.csv.ConvertOptions(
-                include_columns=[str(i) for i in keep],
-                column_types={str(i): pa.string() for i in keep},
-                strings_can_be_null=True,
-                check_utf8=False,  # of another encoding may be a text that no one wants
-            ),
-        ) as reader:
-            yield from reader
-    except pa.ArrowInvalid as err:
-        if not uneven:
-            raise
-        row = uneven[0]
-        at = f" in line {row.number + (layout.start if blanks else 0)}" if row.number is not None else ""
-        found = f"{row.actual_columns} columns{at}: {row.text[:60]!r}"
-        raise DataError("row", str(path), found, f"{row.expected_columns} as in the rows above") from err
+
+def _pieces(path: Path, layout: Layout) -> Iterator[tuple[int, bytes]]:
+    """Whole lines of the rows with the number of lines before them; of blanks only one between words, and comments left out."""
+    with path.open(encoding=layout.encoding, errors="replace", newline=None) as file:
+        for _ in range(layout.start):
+            file.readline(LONGEST_LINE)
+        line = layout.start
+        while text := file.read(PIECE):
+            end = file.readline(LONGEST_LINE)
+            if len(end) >= LONGEST_LINE:
+                raise DataError("log", str(path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
+            text += end
+            lines = text.count("\n")
+            if not layout.names:
+                text = COMMENT.sub("", text)
+            if layout.delimiter is None:
+                text = _single_blanks(text)
+            if text.strip():
+                yield line, text.encode()
+            line += lines
 
 
 def _single_blanks(text: str) -> str:
@@ -132,41 +145,3 @@ def _single_blanks(text: str) -> str:
     while "  " in text:
         text = text.replace("  ", " ")
     return text.replace(" \n", "\n").replace("\n ", "\n").removeprefix(" ").removesuffix(" ")
-
-
-class _Blanks:
-    """A text as a stream of rows with one blank between words, without the lines above them and without comments."""
-
-    def __init__(self, path: Path, layout: Layout) -> None:
-        self.path, self.blanks, self.named = path, layout.delimiter is None, bool(layout.names)
-        self.file = path.open(encoding=layout.encoding, errors="replace", newline=None)
-        for _ in range(layout.start):
-            self.file.readline(LONGEST_LINE)
-        self.left = b""
-
-    def read(self, n: int = -1) -> bytes:
-        if not self.left:
-            text = self.file.read(PIECE)
-            end = self.file.readline(LONGEST_LINE)
-            if len(end) >= LONGEST_LINE:
-                raise DataError("log", str(self.path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
-            text += end
-            if not self.named:
-                text = COMMENT.sub("", text)
-            if self.blanks:
-                text = _single_blanks(text)
-            self.left = text.encode()
-            if text and not self.left.strip():  # nothing but comments; nothing would be the end
-                self.left = b"\n"
-        out, self.left = (self.left, b"") if n < 0 else (self.left[:n], self.left[n:])
-        return out
-
-    @property
-    def closed(self) -> bool:
-        return self.file.closed
-
-    def close(self) -> None:
-        self.file.close()
-
-    def readable(self) -> bool:
-        return True
