@@ -248,7 +248,7 @@ def _check_values(x: np.ndarray, c: Column, path: Path) -> None:
 def _signal(x: np.ndarray, name: str, index: int | None, joint: int, path: Path) -> np.ndarray:
     """One signal (N,) of a source; of two dimensions the longer is time. Without an index it is the column of the joint."""
     if x.ndim > 2:
-        raise DataError(name, str(path), f"{x.ndim} dimensions", "one or two")
+        raise DataError(name, str(path), f"{x.ndim} dimensions, {' x '.join(map(str, x.shape))}", "one or two")
     if x.ndim < 2 or min(x.shape) == 1:
         if index:
             raise DataError(name, str(path), f"index = {index}", "no index, or 0: it has one column")

@@ -91,6 +91,8 @@ class Cells:
         if self.kind == "dates":
             cells = [_text(x).strip() for x in column]
             bad = np.array([c != "" and (not is_date(c) or bool(DATE.match(c)) != bool(DATE.match(self.like))) for c in cells])
+            if not np.any(bad):
+                bad[self._no_date(column)] = True
         else:
             plain = pc.replace_substring(column, ",", ".") if self.comma or (not self.dot and not self.quoted) else column
             bad = ~pc.match_substring_regex(plain, NUMBER).fill_null(True).to_numpy(zero_copy_only=False)
@@ -105,12 +107,26 @@ class Cells:
         self._parts = []
         if not self.wanted:
             return
+        if kind == "dates":
+            raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "dates that exist, all written in one way")
         if first:
             what = "true and false" if text.lower() in ("true", "false") else f"texts: {text[:60]!r} in row {row}"
             raise DataError("signal", str(self.path), f"{self.name} is no array of numbers but of {what}", "numbers")
         if text == self.name:
             raise DataError("signal", str(self.path), f"the header again in row {row}", "one log: cut the file in two there")
-        raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "numbers" if kind == "numbers" else f"dates like {self.like!r}")
+        raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "numbers")
+
+    def _no_date(self, column: pa.Array) -> int:
+        """The first that is written as a date, but is none of the calendar: the first half with one, halved again."""
+        low, high = 0, len(column)
+        while high - low > 1:
+            middle = (low + high) // 2
+            try:
+                parse_dates(column.slice(low, middle - low), self.like, self.order)
+                low = middle
+            except pa.ArrowInvalid:
+                high = middle
+        return low
 
 
 def _cast(column: pa.Array) -> np.ndarray:

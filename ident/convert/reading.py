@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,7 +124,12 @@ def _instead(x: np.ndarray | None) -> str:
     kind = "" if x is None else x.dtype.kind
     if kind == "O" and x is not None and x.size == 1 and x.item() is None:  # as ``_lists`` gives them
         return " but of lists of several lengths"
-    return {"b": " but of true and false", "M": " but of dates", "m": " but of times", "U": " but of texts"}.get(kind, "")
+    if kind == "O" and x is not None and all(isinstance(v, str) for v in x.ravel()[:10]):
+        kind = "U"
+    return {
+        "b": " but of true and false", "M": " but of dates", "m": " but of times", "U": " but of texts", "S": " but of texts",
+        "V": " but of structures", "c": " but of complex numbers", "O": " but of objects",
+    }.get(kind, "")  # fmt: skip
 
 
 def _read(path: Path, wanted: set[str] | None, by: Reader | None = None) -> dict[str, Any]:
@@ -138,8 +144,12 @@ def _read(path: Path, wanted: set[str] | None, by: Reader | None = None) -> dict
     except DataError:
         raise
     except Exception as err:  # each reader raises types of its own for damaged files
-        reason = str(err).splitlines()[0][:160] if str(err) else type(err).__name__
-        raise DataError("log", str(path), f"unreadable ({reason})", "a complete file") from err
+        raise DataError("log", str(path), f"unreadable ({_reason(err)})", "a complete file") from err
+
+
+def _reason(err: Exception) -> str:
+    """The first line of an error, without the address of a Python object."""
+    return re.sub(r"<[^<>]* at 0x[0-9a-f]+>", "the file", str(err)).splitlines()[0][:160] if str(err).strip() else type(err).__name__
 
 
 def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
@@ -181,8 +191,21 @@ def _holds_numbers(kind: pa.DataType) -> bool:
 
 def _npz(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     check_zip(path, wanted)
+    out = {}
     with np.load(path, allow_pickle=False) as file:
-        return {n: file[n] for n in file.files if wanted is None or n in wanted}
+        distinct([name.removesuffix(".npy") for name in file.zip.namelist()], wanted, path)
+        for name in file.files:
+            if wanted is not None and name not in wanted:
+                continue
+            try:
+                out[name] = file[name]
+            except ValueError as err:
+                if wanted is None:  # one that no one may want
+                    continue
+                objects = "Object arrays" in str(err)
+                found = f"{name} is an array of Python objects" if objects else f"{name} is unreadable ({_reason(err)})"
+                raise DataError("signal", str(path), found, "an array of numbers") from err
+    return out
 
 
 def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
