@@ -351,22 +351,32 @@ def convert(
     from ident.dataset_io import save_dataset
 
     if guess:
-        return _guess(files, robot, map_, json_)
+        return _guess(files, robot, map_, json_, quiet)
     if out is None:
         raise DataError("--out", "command line", "no such option", "where to write the dataset, or --guess")
     notes: list[str] = []
-    data = convert_logs(files, robot, map_, name=out.name, say=notes.append)
-    save_dataset(data, out)
+    with _progress(quiet or json_ or _soon_read(files)) as (say, _):
+        data = convert_logs(files, robot, map_, name=out.name, say=notes.append, progress=say)
+        say(f"writing {out}")
+        save_dataset(data, out)
     text = "\n".join([f"{len(data.segments)} segments in {out}", *(f"  {note}" for note in notes)])
     _print({"dataset": str(out), "segments": len(data.segments), "changed": notes}, json_, text)
 
 
-def _guess(files: list[Path], robot: str, out: Path, json_: bool) -> None:
+LARGE_LOG = 50e6  # bytes, below which a log is read before progress could be read
+
+
+def _soon_read(files: list[Path]) -> bool:
+    return sum(f.stat().st_size for f in files if f.is_file()) < LARGE_LOG
+
+
+def _guess(files: list[Path], robot: str, out: Path, json_: bool, quiet: bool) -> None:
     from ident.convert.guess import guess_map
 
     if out.exists():
         raise DataError("--map", str(out), "a file that is there already", "a new file: --guess overwrites no map")
-    guessed = guess_map(files, robot)
+    with _progress(quiet or json_ or _soon_read(files)) as (say, _):
+        guessed = guess_map(files, robot, progress=say)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         beside = out.with_name(f".{out.name}.part")
@@ -376,8 +386,10 @@ def _guess(files: list[Path], robot: str, out: Path, json_: bool) -> None:
         raise DataError("--map", str(out), str(err.strerror or err), "a file that can be written") from err
     rows = [f"first map in {out}; check it, above all the lines marked EDIT"]
     rows += [f"  {channel}: {what}" for channel, what in guessed.found.items()]
+    rows += [f"warning: {text}" for text in guessed.warnings]
     rows += [f"warning: nothing looks like {channel}: name it in the map" for channel in guessed.missing]
-    _print({"map": str(out), "found": guessed.found, "missing": list(guessed.missing)}, json_, "\n".join(rows))
+    result = {"map": str(out), "found": guessed.found, "missing": list(guessed.missing), "warnings": list(guessed.warnings)}
+    _print(result, json_, "\n".join(rows))
 
 
 @app.command()

@@ -19,9 +19,10 @@ import tomlkit
 from scipy.spatial.transform import Rotation
 
 from robot_assets.errors import DataError
+from robot_assets.plausible import doubts
 from robot_assets.robot import Joint, Robot, load_robot
 from robot_assets.urdf import Description, read_urdf
-from robot_assets.values import exists
+from robot_assets.values import LARGEST, exists
 
 GRAVITY = 9.81  # m/s2
 POSTURES = 64  # random ones, over which the seen inertia is taken
@@ -93,9 +94,10 @@ def draft_robot(urdf: str | Path, lock: Mapping[str, float | None] | None = None
     if len(names) > MOST:
         raise DataError("joints", str(path), f"{len(names)} that are free", f"at most {MOST}: lock the others")
     inertia, weight = _seen(root, tree, names, locked)
-    guesses, warnings = [], []
+    guesses, warnings = [], list(doubts(root))
     for j, name in enumerate(names):
         guesses.append(_guess(elements[name], inertia[:, j], float(weight[:, j].max())))
+        _check_figures(guesses[-1], path)
         if inertia[:, j].max() <= 0:
             warnings.append(f"{name} carries no mass in the URDF: complete its <inertial> or add a [[load]]")
     if any(e.find(".//mesh") is not None for e in root.findall("link")):
@@ -129,7 +131,10 @@ def write_robot(
     try:
         shutil.copyfile(source, beside / source.name)
         (beside / "robot.toml").write_text(render(draft, target.name, source.name), encoding="utf-8")
-        load_robot(beside)
+        try:
+            load_robot(beside)
+        except DataError as err:  # of a scratch file that no one has seen
+            raise DataError(err.what, str(urdf), err.found, err.expected) from err
         beside.chmod(0o755)
         if target.exists():
             target.rmdir()
@@ -226,12 +231,26 @@ def _guess(element: ET.Element, inertia: np.ndarray, weight: float) -> JointGues
     return JointGuess(joint, linear, (float(inertia.min()), float(inertia.max())), weight, ordered)
 
 
+def _check_figures(guess: JointGuess, path: Path) -> None:
+    """Raise a DataError where the bodies that a joint carries give figures of no drive."""
+    for field in guess.reasons:
+        value = getattr(guess.joint, field)
+        if not 0 < value <= LARGEST:
+            low, high = guess.inertia
+            found = f"{low:.3g} to {high:.3g} {_unit('kg m2', guess.prismatic)} carried, which gives {field} = {value:.3g}"
+            raise DataError(f"joint {guess.joint.name}", str(path), found, "masses and inertias of an arm on the links beyond it")
+
+
 def _locked(path: Path, tree: Description, elements: dict[str, ET.Element], lock: dict) -> dict[str, float]:
     for name in lock:
         if name not in tree.limits:
             raise DataError("--lock", str(path), name, f"a movable joint: {sorted(tree.limits)}")
         if lock[name] is not None and not abs(lock[name]) < 1e6:
             raise DataError("--lock", str(path), f"{name}={lock[name]}", "a position in rad or m")
+        low, high = tree.limits[name]
+        given = elements[name].find("limit") is not None and tree.kinds[name] != "continuous"
+        if lock[name] is not None and given and not low <= lock[name] <= high:
+            raise DataError("--lock", str(path), f"{name}={lock[name]:g}", f"a position within its limits, {low:g} to {high:g}")
     for name in tree.limits:
         if elements[name].find("mimic") is not None:
             lock.setdefault(name, None)

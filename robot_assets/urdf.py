@@ -13,6 +13,7 @@ from robot_assets.errors import DataError
 from robot_assets.values import LARGEST
 
 MOVABLE = ("revolute", "continuous", "prismatic")
+SHORTEST = 1e-6  # of an axis
 MOST = 1000  # links, and joints
 NEGATIVE = 1e-3  # of the largest moment of inertia: what rounding in a file may leave below zero
 EXCESS = 0.02  # of the largest moment, by which it may exceed the other two together: rounding in a file
@@ -70,6 +71,8 @@ def read_urdf(path: Path) -> Description:
             axis = _vector(joint.find("axis"), "xyz", f"axis of joint {name}", path, "1 0 0")
             if not np.any(axis):
                 raise DataError(f"axis of joint {name}", str(path), "a zero vector", "a direction")
+            if not SHORTEST <= np.abs(axis).max():  # the square of less may be zero
+                raise DataError(f"axis of joint {name}", str(path), f"a vector of {np.abs(axis).max():.3g}", "a direction, of about length one")
             x, y, z = np.asarray(axis) / np.linalg.norm(axis)
             axes[name] = (float(x), float(y), float(z))
         elif joint.get("type") != "fixed":
@@ -133,6 +136,9 @@ def _check_mimics(joints: list[tuple[str, ET.Element]], path: Path) -> None:
     """Raise a DataError where a joint mimics none of the URDF, or in the end itself."""
     leads = {name: str(mimic.get("joint")) for name, e in joints if (mimic := e.find("mimic")) is not None}
     names = {name for name, _ in joints}
+    for name, joint in joints:
+        for key, default in (("multiplier", "1"), ("offset", "0")) if (mimic := joint.find("mimic")) is not None else ():
+            _number(mimic.get(key, default), f"{key} of the mimic of joint {name}", path)
     for name in leads:
         at, steps = name, 0
         while at in leads and steps <= len(leads):

@@ -21,7 +21,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         DataError: where it is missing, is no text or no TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))  # editors of Windows write a mark before it
     except UnicodeDecodeError as err:
         raise DataError(what, str(path), "bytes that are no UTF-8", "UTF-8 text") from err
     except OSError as err:

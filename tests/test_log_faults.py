@@ -1,6 +1,9 @@
 """Logs as users have them: gaps, wrapped angles, other encodings, torques of another run."""
 
+import io
 import time
+import warnings
+import zipfile
 
 import h5py
 import numpy as np
@@ -194,6 +197,48 @@ def test_truth_values_are_no_positions(tmp_path):
         assert list(list_signals(tmp_path / name)) == ["tau"]
         with pytest.raises(DataError, match="q is no array of numbers but of true and false"):
             convert_logs([tmp_path / name], "twomass", tmp_path / "map.toml")
+
+
+def stored(array, **options):
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
+
+
+MEMBERS = {
+    "twice": (("x.npy", "x.npy"), stored(np.ones(100)), "x twice"),
+    "structures": (("x.npy",), stored(np.zeros(100, [("a", float)])), "x is no array of numbers but of structures"),
+    "pickled": (("x.npy",), stored(np.array([1, None] * 50, object), allow_pickle=True), "x is an array of Python objects"),
+    "texts": (("x.npy",), stored(np.array(["a"] * 100)), "x is no array of numbers but of texts"),
+    "complex": (("x.npy",), stored(np.ones(100) * 1j), "x is no array of numbers but of complex numbers"),
+    "three dimensions": (("x.npy",), stored(np.ones((100, 3, 4))), "3 dimensions, 100 x 3 x 4"),
+    "no header": (("x.npy",), b"\x93NUMPY\x01\x00\x76\x00" + b"{'descr': object()}".ljust(117) + b"\n", "x is unreadable"),
+}
+
+
+@pytest.mark.parametrize("kind", MEMBERS)
+def test_members_of_an_archive_that_are_no_numbers_are_named(tmp_path, kind):
+    names, content, found = MEMBERS[kind]
+    with zipfile.ZipFile(tmp_path / "log.npz", "w") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name, data in (("tau.npy", stored(np.ones(100))), *((n, content) for n in names)):
+            file.writestr(name, data)
+    (tmp_path / "map.toml").write_text(f'sample_rate = {RATE}\n[columns]\ntau_1 = "tau"\nq_1 = "x"\n')
+    with pytest.raises(DataError, match=found) as caught:
+        convert_logs([tmp_path / "log.npz"], "twomass", tmp_path / "map.toml")
+    assert " at 0x" not in str(caught.value)
+    if kind != "twice":  # what a map does not name is not in its way
+        assert "tau" in list_signals(tmp_path / "log.npz")
+
+
+@pytest.mark.parametrize(("row", "date"), [(0, "2026-13-45 10:00:00.000"), (777, "2026-02-30 10:00:07.770"), (777, "2026-01-31 25:00:07.770"), (777, "noon")])
+def test_a_date_that_is_none_of_the_calendar_is_named_with_its_row(tmp_path, row, date):
+    texts = [f"2026-01-31 10:00:{k / 100:06.3f}" for k in range(1000)]
+    texts[row] = date
+    (tmp_path / "log.csv").write_text("t,tau,q\n" + "\n".join(f"{t},1,2" for t in texts) + "\n")
+    (tmp_path / "map.toml").write_text('sample_rate = 100.0\n[time]\nsource = "t"\n[columns]\ntau_1 = "tau"\nq_1 = "q"\n')
+    with pytest.raises(DataError, match=f"t = '{date}' in row {row + 1}, expected dates"):
+        convert_logs([tmp_path / "log.csv"], "twomass", tmp_path / "map.toml")
 
 
 @pytest.mark.parametrize(("option", "refused"), [("scale = 1e-320", True), ("gear = 1e-300", True), ("scale = 1e-6", False)])

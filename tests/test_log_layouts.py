@@ -216,6 +216,44 @@ def test_arrays_of_structures_and_cells_of_matlab(tmp_path, kind):
     assert name in str(caught.value).replace("(1)", "(3)").replace("{1}", "{3}")
 
 
+@pytest.mark.parametrize("damaged", [False, True])
+def test_files_of_a_joint_each_with_clocks_of_their_own(tmp_path, damaged):
+    files = []
+    for j in range(6):
+        t = 1e3 * T
+        if damaged and j == 4:
+            t[[500, 501]] = t[[501, 500]]
+        files.append(written(tmp_path / f"joint{j + 1}.csv", {"time_ms": t, "pos_deg": np.rad2deg(Q[:, j]), "torque_Nm": TAU[:, j]}))
+    guessed, data = converted(files)
+    assert np.allclose(whole(data, "q"), Q, atol=1e-9) and np.allclose(whole(data, "tau"), TAU, atol=1e-6)
+    assert ("time" in guessed.found) != damaged
+    assert guessed.warnings == (("no time: joint5:time_ms goes back in row 502 (from 1002 to 1000)",) if damaged else ())
+
+
+@pytest.mark.parametrize("kind", ["list", "fixed list", "decimal", "list of decimals"])
+def test_lists_and_decimals_of_parquet(tmp_path, kind):
+    q, tau = np.round(Q, 6), np.round(TAU, 6)
+    number = pa.decimal128(18, 6)
+    if kind == "decimal":
+        columns = {f"{k}_{j + 1}": pa.array(x[:, j]).cast(number) for k, x in {"pos": q, "torque": tau}.items() for j in range(6)}
+    else:
+        of = {"list": pa.list_(pa.float64()), "fixed list": pa.list_(pa.float64(), 6), "list of decimals": pa.list_(number)}[kind]
+        columns = {k: pa.array(list(x)).cast(of) for k, x in {"position": q, "effort": tau}.items()}
+    pq.write_table(pa.table({"timestamp": T, "name": [["a", "b"]] * N, "empty": pa.array([[]] * N, pa.list_(pa.float64()))} | columns), tmp_path / "log.parquet")
+    _, data = converted(tmp_path / "log.parquet")
+    assert np.allclose(whole(data, "q"), q, atol=1e-12) and np.allclose(whole(data, "tau"), tau, atol=1e-12)
+
+
+def test_lists_of_several_lengths_are_no_signal(tmp_path):
+    lists = [list(x) for x in Q]
+    lists[700] = lists[700][:5]
+    pq.write_table(pa.table({"x": pa.array(lists), "u": TAU[:, 0]}), tmp_path / "log.parquet")
+    assert list(list_signals(tmp_path / "log.parquet")) == ["u"]
+    (tmp_path / "map.toml").write_text(f"sample_rate = {RATE}\n{BENCH}")
+    with pytest.raises(DataError, match="x is no array of numbers but of lists of several lengths"):
+        convert_logs([tmp_path / "log.parquet"], "twomass", tmp_path / "map.toml")
+
+
 def test_a_log_in_which_nothing_is_recognised_is_an_error_and_leaves_no_map(tmp_path):
     log = written(tmp_path / "log.csv", {"t": T} | {f"thing {k}": TAU[:, k] for k in range(4)})
     result = run("convert", log, "--robot", "ur10_bare", "--guess", "--map", tmp_path / "map.toml")

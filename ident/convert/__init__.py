@@ -11,13 +11,13 @@ import numpy as np
 
 from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
 from ident.convert.joining import on_one_clock
-from ident.convert.mapping import LogMap, read_map
+from ident.convert.mapping import Column, LogMap, read_map
 from ident.convert.reading import read_log
 from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
 from ident.segment_file import LARGEST, SHORTEST
 from robot_assets.errors import DataError
-from robot_assets.robot import ASSETS, load_robot
+from robot_assets.robot import ASSETS, linear_joints, load_robot
 
 
 def convert_logs(
@@ -27,20 +27,24 @@ def convert_logs(
     *,
     name: str = "log",
     say: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> Dataset:
     """Read logs by a map; each log gives one segment, one for each part of a multisine, or two by a split.
 
     Args:
         files: one log each, or by ``[files]`` of the map several a log (those of one folder).
-        say: told in words what was changed on the way (resampling, gaps).
+        say: told in words what was changed on the way (resampling, gaps). progress: what is being done.
 
     Raises:
         DataError: for a log, map or robot that cannot be used.
     """
     arm = load_robot(robot)
-    log_map = read_map(map_path, arm.array("gear_ratio"))
+    log_map = read_map(map_path, arm.array("gear_ratio"), linear_joints(arm))
     segments: list[Segment] = []
-    for log_name, paths in _logs([Path(f) for f in files], log_map, str(map_path)):
+    logs = _logs([Path(f) for f in files], log_map, str(map_path))
+    _check_roles(logs, log_map, str(map_path))
+    for log_name, paths in logs:
+        progress(f"reading {', '.join(p.name for p in paths.values())}")
         found = _segments(log_name, paths, log_map, arm.n, say)
         short = [s for s in found if s.n_samples < SHORTEST]
         if short:
@@ -89,6 +93,23 @@ def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str,
     return [(folder.name or "log", log) for folder, log in folders.items()]
 
 
+def _called(name: str, path: Path) -> tuple[str, ...]:
+    """How [roles] may call a log."""
+    return name, path.stem, path.name
+
+
+def _check_roles(logs: list[tuple[str, dict[str, Path]]], m: LogMap, where: str) -> None:
+    """Raise a DataError where a role is that of no log: what was to be held out would be fitted to."""
+    names = {called for name, paths in logs for called in _called(name, next(iter(paths.values())))}
+    stray = sorted(set(m.roles) - names)
+    if stray and m.whole:
+        raise DataError("[roles]", where, f"{stray[0]}, which is none of the files given", f"one of {sorted(names)}")
+    for name, paths in logs:
+        own = {called: m.roles[called] for called in _called(name, next(iter(paths.values()))) if called in m.roles}
+        if len(set(own.values())) > 1:
+            raise DataError("[roles]", where, f"two roles of one log: {own}", "one")
+
+
 def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
     if not m.files:
         return read_log(paths[""], m.sources, {m.time} if m.time else frozenset())
@@ -123,7 +144,13 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
         x = data[m.time].ravel()
         if len(x) != N:
             raise DataError(m.time, str(path), f"{len(x)} time stamps", f"one for each of {N} samples")
-        clock = check_stamps(stamp_seconds(x, m.time_factor, x[0]), m.sample_rate, path)
+        seconds = stamp_seconds(x, m.time_factor, x[0])
+        for source, factor in m.time_plus:
+            other = data[source].ravel()
+            if len(other) != N:
+                raise DataError(source, str(path), f"{len(other)} values", f"one for each of {N} samples")
+            seconds = seconds + stamp_seconds(other, factor, other[0])
+        clock = check_stamps(seconds, m.sample_rate, path)
         clocks, t = [clock], uniform_times(0.0, float(clock.t[-1]), m.sample_rate)
         if not at_times(clock, t, m.sample_rate):
             rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)
@@ -171,7 +198,7 @@ def _cut(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np
 
 
 def _motions(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray]) -> list[Segment]:
-    role = next((m.roles[k] for k in (name, path.stem, path.name) if k in m.roles), None)
+    role = next((m.roles[k] for k in _called(name, path) if k in m.roles), None)
     if m.split is None or role is not None:
         return [Segment(name=name, kind="trajectory", role=role or "identification", t=t, **channels)]
     cut = int(m.split * len(t))
@@ -185,12 +212,12 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
     out: dict[str, np.ndarray] = {}
     length = None
     for c in m.columns:
-        x = _signal(data[c.source], c.source, c.index, path)
+        x = _signal(data[c.source], c.source, c.index, c.joint, path)
         if c.turn is not None:
             x = np.unwrap(x, period=c.turn)  # before the gear: a motor's encoder wraps once a turn of the motor
         x = x * c.factor + c.offset
         for source, factor, index in c.plus:
-            other = _signal(data[source], source, index, path)
+            other = _signal(data[source], source, index, c.joint, path)
             if len(other) != len(x):
                 raise DataError(source, str(path), f"{len(other)} samples", f"{len(x)} as in {c.source}")
             x = x + factor * other
@@ -199,27 +226,36 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
         length = len(x)
         target = out.setdefault(c.channel, np.full((length, n), np.nan if c.channel == "q_link" else 0.0))
         target[:, c.joint] = x
-    for channel, x in out.items():
-        bad = ~np.isfinite(x) & ~(np.isnan(x) & (channel == "q_link"))
-        if np.any(bad):
-            k = int(np.flatnonzero(bad.any(axis=1))[0])
-            raise DataError(channel, str(path), f"a value that is not finite at sample {k}", "finite numbers")
-        if np.any(np.abs(x) > LARGEST):
-            k = int(np.flatnonzero((np.abs(x) > LARGEST).any(axis=1))[0])
-            raise DataError(channel, str(path), f"{np.nanmax(np.abs(x[k])):.3g} at sample {k}", f"at most {LARGEST:g} in SI units")
+        _check_values(x, c, path)
     if not length:
         raise DataError("signals", str(path), "no samples", "at least one")
     return out
 
 
-def _signal(x: np.ndarray, name: str, index: int, path: Path) -> np.ndarray:
-    """One signal (N,) of a source; of two dimensions the longer is time."""
+def _check_values(x: np.ndarray, c: Column, path: Path) -> None:
+    """Raise a DataError where a column (N,) of the dataset has a value that it cannot hold; a link encoder may have none."""
+    bad = np.flatnonzero(~np.isfinite(x) & ~(np.isnan(x) & (c.channel == "q_link")))
+    name = f"{c.channel}_{c.joint + 1}"
+    if len(bad):
+        kind = "NaN" if np.isnan(x[bad[0]]) else "infinity"
+        found = f"{kind} of {c.source} at sample {bad[0]} ({len(bad)} not finite in all)"
+        raise DataError(name, str(path), found, "finite numbers")
+    large = np.flatnonzero(np.abs(x) > LARGEST)
+    if len(large):
+        raise DataError(name, str(path), f"{x[large[0]]:.3g} of {c.source} at sample {large[0]}", f"at most {LARGEST:g} in SI units")
+
+
+def _signal(x: np.ndarray, name: str, index: int | None, joint: int, path: Path) -> np.ndarray:
+    """One signal (N,) of a source; of two dimensions the longer is time. Without an index it is the column of the joint."""
     if x.ndim > 2:
-        raise DataError(name, str(path), f"{x.ndim} dimensions", "one or two")
+        raise DataError(name, str(path), f"{x.ndim} dimensions, {' x '.join(map(str, x.shape))}", "one or two")
     if x.ndim < 2 or min(x.shape) == 1:
+        if index:
+            raise DataError(name, str(path), f"index = {index}", "no index, or 0: it has one column")
         return x.ravel()
     if x.shape[0] < x.shape[1]:
         x = x.T
-    if index >= x.shape[1]:
-        raise DataError(name, str(path), f"{x.shape[1]} columns", f"column {index} (index counts from 0)")
-    return x[:, index]
+    column = joint if index is None else index
+    if column >= x.shape[1]:
+        raise DataError(name, str(path), f"{x.shape[1]} columns", f"column {column} (index counts from 0)")
+    return x[:, column]

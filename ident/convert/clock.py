@@ -68,8 +68,14 @@ def check_stamps(t: np.ndarray, rate: float, path: Path) -> Stamps:
         DataError: where they are not finite, go back, have a gap too long to be filled, or are in another unit.
     """
     step = np.diff(t)
-    if not np.all(np.isfinite(t)) or np.any(step < 0):
-        raise DataError("time", str(path), "stamps that are not finite or go back", "rising time stamps")
+    bad = np.flatnonzero(~np.isfinite(t))
+    if len(bad):
+        raise DataError("time", str(path), f"no stamp at sample {bad[0]} ({len(bad)} not finite in all)", "a stamp for each sample")
+    back = np.flatnonzero(step < 0)
+    if len(back):
+        k, more = int(back[0]), f", {len(back)} times in all" if len(back) > 1 else ""
+        found = f"a stamp that goes back by {-step[k]:.6g} s at sample {k + 1}{more}"
+        raise DataError("time", str(path), found, "rising time stamps: cut the log into two where it begins anew")
     span = t[-1] - t[0]
     if span * rate > LONGEST * len(t) or span * rate < len(t) / LONGEST:
         found = f"{len(t)} samples over {span:.4g} s"

@@ -35,6 +35,9 @@ QUANTITIES = (
     | {"degC": "temperature"}
 )
 LENGTHS = ("m", "mm", "um")
+PREFIXED = ("mNm", "kNm", "mN", "kN", "mA")  # units that a capital does not part
+# Names of KUKA's Robot Sensor Interface.
+CALLED = {"aipos": ("act", "pos"), "aspos": ("soll", "pos"), "eipos": ("external", "pos"), "macur": ("act", "cur"), "mecur": ("external", "cur")}
 TOLD = 3.0  # as surely as a name at its best
 
 
@@ -47,13 +50,16 @@ def oriented(x: np.ndarray) -> np.ndarray:
 
 def words_of(name: str) -> tuple[str, ...]:
     """Parts of a name: "rec.actPos_mot1" gives rec, act, pos, mot; "Istposition" gives ist, position."""
-    name = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", name)
-    words = (w.lower() for w in re.findall(r"[A-Za-zµ]+", name))
-    return tuple(part for w in words for part in _split(w))
+    words = []
+    for word in re.findall(r"[A-Za-zµ]+", name):
+        words += [word] if word in PREFIXED else re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", word).split()
+    return tuple(part for w in words for part in _split(w.lower()))
 
 
 def _split(word: str) -> tuple[str, ...]:
     """A word, or the two that it is put together of: a role and a quantity."""
+    if word in CALLED:
+        return CALLED[word]
     quantities = [q for table in WORDS.values() for q in table if len(q) > 2]
     for role in (*REFERENCE, *LINK, *MOTOR, *ACTUAL):
         rest = word.removeprefix(role)

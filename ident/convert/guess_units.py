@@ -11,16 +11,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.convert.mapping import UNITS
+from ident.convert.quantities import UNITS
 from robot_assets.robot import Robot
 
 NAMED_UNITS = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "rad": "rad", "radians": "rad", "mrad": "mrad", "rpm": "rpm", "mm": "mm",
-    "nm": "N m", "mnm": "mN m", "knm": "kN m", "ma": "mA", "amp": "A", "amps": "A", "volt": "V", "voltage": "V",
-    "ns": "ns", "us": "us", "usec": "us", "ms": "ms", "msec": "ms", "s": "s", "sec": "s",
+    "nm": "N m", "mnm": "mN m", "knm": "kN m", "kn": "kN", "ma": "mA", "amp": "A", "amps": "A", "volt": "V", "voltage": "V",
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecs", "nanosecond", "nanoseconds"), "ns"),
+    **dict.fromkeys(("us", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
 }  # fmt: skip
 TURNS = {"rad": 2 * np.pi, "deg": 360.0, "mrad": 2e3 * np.pi, "rev": 1.0}  # a full turn, in the units that logs wrap in
 NEAR = 0.25  # of a turn, between two samples: a joint that is faster hides where it wraps
+REVERSALS, SAMPLES = 3, 500  # of a motion, below which neither friction nor sizes tell a sign or a side
+HYSTERESIS = 0.05  # of the range of a motion, by which it must go back to be turning round
+LOOKED_AT = 4000  # samples in which turns are counted
+ELECTRIC = ("A", "mA", "V")
 CURRENTS = ("current", "currents", "curr", "cur", "strom", "iq")
 
 
@@ -63,7 +70,7 @@ def guess_scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate
     out: dict[str, Scale] = {}
     velocity = None
     # A drive that reports torque before the gear mostly reports its position there too.
-    before = "tau" in chosen and _before_gear(chosen["tau"].x * UNITS[_torque_unit(chosen["tau"], linear)], arm)
+    before = "tau" in chosen and _before_gear(chosen["tau"], _torque_unit(chosen["tau"], linear), arm) and bool(np.mean(_turned(chosen.get("q"))) >= 0.5)
     for channel in ("q", "q_ref", "q_link"):
         if channel in chosen:
             out[channel] = _position(chosen[channel], arm, linear, rate, before and channel != "q_link")
@@ -78,13 +85,37 @@ def guess_scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate
     return out
 
 
-def _before_gear(torque: np.ndarray, arm: Robot) -> bool:
-    """Whether torques (N, n) are of the size that a motor has before its gear.
+def _before_gear(torque: Family, unit: str, arm: Robot) -> bool:
+    """Whether torques are of the size that a motor has before its gear; currents tell nothing without their constant.
 
     Between three hundredths of the limit and a little more than it is where torques of a log lie.
     """
-    ratio, share = np.abs(arm.array("gear_ratio")), np.abs(torque).max(axis=0) / arm.array("torque_limit")
+    if unit in ELECTRIC:
+        return False
+    ratio, share = np.abs(arm.array("gear_ratio")), np.abs(torque.x * UNITS[unit]).max(axis=0) / arm.array("torque_limit")
     return bool(np.any(ratio > 3) and np.median(share) < 0.1 and 0.03 < np.median(share * ratio) < 3.0)
+
+
+def _turned(position: Family | None) -> np.ndarray:
+    """(n,) whether a motion turns round often enough to tell of its torque: one that goes one way shows friction as gravity."""
+    if position is None or len(position.x) < SAMPLES:
+        return np.zeros(1 if position is None else position.x.shape[1], bool)
+    x = position.x[:: max(1, len(position.x) // LOOKED_AT)]
+    return np.array([_reversals(column) >= REVERSALS for column in x.T])
+
+
+def _reversals(x: np.ndarray) -> int:
+    """How often a position (N,) turns round, by more than its noise."""
+    size = HYSTERESIS * float(np.ptp(x))
+    low = high = float(x[0])
+    turns, up = 0, None
+    for v in x.tolist() if size > 0 else ():
+        low, high = min(low, v), max(high, v)
+        if up is not False and v < high - size:
+            turns, up, low = turns + (up is True), False, v
+        elif up is not True and v > low + size:
+            turns, up, high = turns + (up is False), True, v
+    return turns
 
 
 def _unit_of(family: Family, allowed: Sequence[str]) -> str | None:
@@ -171,19 +202,26 @@ def _torque(family: Family, position: Family | None, scale: Scale | None, arm: R
     factor = np.full(arm.n, UNITS[unit])
     share = float(np.median(np.abs(family.x * factor).max(axis=0) / arm.array("torque_limit")))
     options, notes = [], [range_text(family.x)]
-    if unit in ("A", "mA", "V"):
+    if unit in ELECTRIC:
         options.append("torque_constant = 1.0")
-        notes.append(f"EDIT: the torque constant, or the unit if this is a {'force' if np.all(linear) else 'torque'} after all")
-    if _before_gear(family.x * factor, arm):
+        notes.append(f"EDIT: the torque constant (side = \"motor\" where it is that before the gear), or the unit if this is a {'force' if np.all(linear) else 'torque'} after all")
+    turned = np.broadcast_to(_turned(position), arm.n)
+    before = _before_gear(family, unit, arm)
+    if before and np.mean(turned) < 0.5:
+        notes.append(f'EDIT: {share:.2g} of the torque limit: before the gear (side = "motor")? The motion turns round too seldom to tell')
+    elif before:
         side, factor = "motor", factor * arm.array("gear_ratio")
-        notes.append(f"{share:.2g} of the torque limit: before the gear by its size")
-    elif share > 3.0:
+        notes.append(f"EDIT? {share:.2g} of the torque limit: before the gear by its size")
+    elif share > 3.0 and unit not in ELECTRIC:
         notes.append(f"EDIT: {share:.3g} times the torque limit")
-    elif share < 0.03:
+    elif share < 0.03 and unit not in ELECTRIC:
         notes.append(f"EDIT? only {share:.2g} of the torque limit: is the unit right?")
     signs = np.ones(arm.n)
     if position is not None and scale is not None:
-        signs = _friction_sign(position.x * scale.factor, family.x * factor, rate)
+        signs = _friction_sign(position.x * scale.factor, family.x * factor, rate, turned)
+        if not np.all(turned):
+            which = "all joints" if not np.any(turned) else "joints " + ", ".join(str(j + 1) for j in np.flatnonzero(~turned))
+            notes.append(f"EDIT? signs as they stand: {which} turn round too seldom for friction to tell")
     options = [*_options(unit, side), *options]
     if np.any(signs < 0):
         options.append("sign = -1")
@@ -191,26 +229,31 @@ def _torque(family: Family, position: Family | None, scale: Scale | None, arm: R
     return Scale(factor * signs, tuple(options), "; ".join(notes), signs)
 
 
-def _friction_sign(q: np.ndarray, tau: np.ndarray, rate: float) -> np.ndarray:
-    """(n,) -1 where friction would feed energy in: the sign of a torque is then wrong."""
+def _friction_sign(q: np.ndarray, tau: np.ndarray, rate: float, turned: np.ndarray) -> np.ndarray:
+    """(n,) -1 where friction would feed energy in, in both halves of the log: the sign of a torque is then wrong."""
     out = np.ones(q.shape[1])
-    step = max(1, len(q) // 20000)
-    for j in range(q.shape[1]):
-        v = np.gradient(q[:, j], 1 / rate)
-        if np.std(v) < 1e-9:
-            continue
-        a = np.gradient(v, 1 / rate)
-        slow = 0.1 * np.abs(v).max() + 1e-12
-        columns = [np.tanh(v / slow), a, np.ones_like(v), q[:, j], np.sin(q[:, j]), np.cos(q[:, j])]
-        A = np.stack(columns, axis=1)[::step]
-        A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-        y = tau[::step, j]
-        x, *_ = np.linalg.lstsq(A, y, rcond=1e-9)
-        # Friction as a share of what the other columns leave: too small a share decides nothing.
-        rest = y - A[:, 1:] @ x[1:]
-        if x[0] < 0 and np.linalg.norm(x[0] * A[:, 0]) > 0.5 * np.linalg.norm(rest):
+    half = len(q) // 2
+    for j in np.flatnonzero(turned):
+        if all(_feeds(q[part, j], tau[part, j], rate) for part in (slice(None), slice(None, half), slice(half, None))):
             out[j] = -1.0
     return out
+
+
+def _feeds(q: np.ndarray, tau: np.ndarray, rate: float) -> bool:
+    """Whether friction that is fitted to a torque (N,) has the wrong sign, and is no small part of it."""
+    v = np.gradient(q, 1 / rate)
+    if np.std(v) < 1e-9:
+        return False
+    a = np.gradient(v, 1 / rate)
+    slow = 0.1 * np.abs(v).max() + 1e-12
+    step = max(1, len(q) // 20000)
+    A = np.stack([np.tanh(v / slow), a, np.ones_like(v), q, np.sin(q), np.cos(q)], axis=1)[::step]
+    A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+    y = tau[::step]
+    x, *_ = np.linalg.lstsq(A, y, rcond=1e-9)
+    # Friction as a share of what the other columns leave: too small a share decides nothing.
+    rest = y - A[:, 1:] @ x[1:]
+    return bool(x[0] < 0 and np.linalg.norm(x[0] * A[:, 0]) > 0.5 * np.linalg.norm(rest))
 
 
 def _options(unit: str, side: str, sign: int = 1) -> tuple[str, ...]:

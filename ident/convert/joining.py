@@ -49,7 +49,7 @@ def on_one_clock(
         signals = {k: _by_time(x, len(clock.t), k, paths[f.prefix]) for k, x in own.items()}
         for c in m.columns:
             x = signals.get(c.source) if c.turn is not None else None
-            k = 0 if x is None or x.shape[1] == 1 else c.index
+            k = 0 if x is None or x.shape[1] == 1 else c.joint if c.index is None else c.index
             if x is not None and k < x.shape[1]:
                 # Before samples are put between: halfway between two ends of a turn is nowhere.
                 signals[c.source] = np.concatenate([x[:, :k], np.unwrap(x[:, [k]], period=c.turn, axis=0), x[:, k + 1 :]], axis=1)

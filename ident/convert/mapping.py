@@ -10,19 +10,21 @@ from typing import Any
 
 import numpy as np
 
+from ident.convert.quantities import KINDS, unit_factor, units_of
 from robot_assets.errors import DataError
 from robot_assets.values import choice, exists, number, read_toml, show, subtable, tables, text, whole
 
-UNITS = {
-    "rad": 1.0, "deg": np.pi / 180, "mrad": 1e-3, "rev": 2 * np.pi, "rad/s": 1.0, "deg/s": np.pi / 180,
-    "rpm": np.pi / 30, "N m": 1.0, "mN m": 1e-3, "kN m": 1e3, "N": 1.0, "kN": 1e3, "A": 1.0, "mA": 1e-3, "V": 1.0,
-    "m": 1.0, "mm": 1e-3, "um": 1e-6, "m/s": 1.0, "mm/s": 1e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
-    "degC": 1.0,
-}  # fmt: skip
 SMALLEST = 1e-15  # a factor that leaves nothing of any signal
 COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
 OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap", "plus"}
 KEYS = {"sample_rate", "input_hold", "time", "files", "columns", "multisine", "roles", "split"}
+PLUS_KEYS = {"source", "factor", "index"}
+TIME_KEYS = {"source", "unit", "plus"}
+TIME_PLUS_KEYS = {"source", "unit"}
+FILE_KEYS = {"name", "width", "time", "unit", "shift"}
+MULTISINE_KEYS = {"period", "operating_point", "excited_from", "excited_threshold", "excited_lines", "part"}
+PART_KEYS = {"first", "last", "role"}
+TIMES = list(KINDS["time"])
 ROLES = ("identification", "validation")
 SHIPPED = Path(__file__).parent / "maps"
 
@@ -34,7 +36,7 @@ class Column:
     Attributes:
         factor: everything multiplicative: unit, sign, scale, torque constant and gear ratio.
         offset: in the unit of the dataset, added last.
-        index: column of a two-dimensional source, from 0.
+        index: column of a two-dimensional source, from 0; None: that of the joint.
         turn: of the source, in its own units, by which it jumps where it wraps; None where it does not.
         plus: (source, factor, index) of further terms: gears that couple joints.
     """
@@ -44,9 +46,9 @@ class Column:
     source: str
     factor: float
     offset: float
-    index: int
+    index: int | None
     turn: float | None
-    plus: tuple[tuple[str, float, int], ...] = ()
+    plus: tuple[tuple[str, float, int | None], ...] = ()
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -87,8 +89,9 @@ class LogMap:
 
     Attributes:
         sample_rate: Hz, of the dataset. time_factor: s per unit of the time column.
+        time_plus: (source, s per unit) of what is added to it: full seconds with their fraction beside them.
         files: where a log is spread over several; else empty.
-        roles: file name or its stem -> role. split: share of a file without a role that is for
+        roles: file name or its stem -> role; whole: whether each must be of a file given. split: share of a file without a role that is for
             identification, the rest validates.
     """
 
@@ -106,47 +109,52 @@ class LogMap:
     excited_lines: tuple[int, ...]
     roles: dict[str, str]
     split: float | None
+    whole: bool = True
+    time_plus: tuple[tuple[str, float], ...] = ()
 
     @property
     def sources(self) -> set[str]:
         """Names of all signals that the map reads."""
         out = {s for c in self.columns for s in c.sources}
         out |= {f"{f.prefix}:{f.time}" for f in self.files if f.time is not None}
+        out |= {s for s, _ in self.time_plus}
         return out | {s for s in (self.time, self.excited_from) if s is not None}
 
 
-def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
+def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap:
     """Read a map file, or one of ``SHIPPED`` by its name.
 
     Args:
         ratios: (n,) gear ratios of the robot, for columns with ``side = "motor"``.
+        linear: (n,) whether a joint is linear.
 
     Raises:
         DataError: with the key at fault.
     """
     file = Path(path)
-    if not exists(file) and exists(SHIPPED / f"{path}.toml") and file.name == str(path):
+    shipped = not exists(file) and exists(SHIPPED / f"{path}.toml") and file.name == str(path)
+    if shipped:
         file = SHIPPED / f"{path}.toml"
     if not exists(file):
         raise DataError("map", str(path), "no such file", f"a map, or one of {sorted(p.stem for p in SHIPPED.glob('*.toml'))}")
     where = str(file)
     data = read_toml(file, "map")
-    stray = set(data) - KEYS
-    if stray:
-        raise DataError(min(stray), where, "an unknown key", f"one of {sorted(KEYS)}")
+    _known(data, KEYS, "", where)
     entries = data.get("columns")
     if not isinstance(entries, dict) or not entries:
         raise DataError("[columns]", where, show(entries), 'a table such as q_1 = { source = "angle", unit = "deg" }')
-    columns = tuple(_column(k, v, ratios, where) for k, v in entries.items())
+    columns = tuple(_column(k, v, ratios, linear, where) for k, v in entries.items())
     have = {(c.channel, c.joint) for c in columns}
     for channel in ("tau", "q"):
         for j in range(len(ratios)):
             if (channel, j) not in have:
                 raise DataError(f"{channel}_{j + 1}", where, "no such column", f"{channel}_1 to {channel}_{len(ratios)}")
     time = subtable(data, "time", where)
+    _known(time, TIME_KEYS, "time.", where)
     multisine = subtable(data, "multisine", where)
+    _known(multisine, MULTISINE_KEYS, "multisine.", where)
     parts = tuple(_part(entry, where) for entry in tables(multisine, "part", where))
-    if multisine and not parts:
+    if "multisine" in data and not parts:
         raise DataError("[[multisine.part]]", where, "none", "the periods of at least one segment")
     by_first = sorted(parts, key=lambda p: p.first)
     for a, b in itertools.pairwise(by_first):
@@ -160,9 +168,15 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
     if period is not None and lines and max(lines) >= period / 2:
         raise DataError("multisine.excited_lines", where, f"line {max(lines)}", f"lines below Nyquist, {period / 2:g}")
     roles = subtable(data, "roles", where)
-    files, source = tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items()), text(time, "source", where) if time else None
-    factor = _unit(time.get("unit", "s"), "time", where)
-    if files and source is not None and not any(source.startswith(f"{f.prefix}:") for f in files):
+    if roles and period is not None:
+        raise DataError("[roles]", where, "[multisine] as well", "role in [[multisine.part]]: it is that of each segment")
+    files = tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items())
+    source = text(time, "source", f"{where} time") if "time" in data else None
+    factor = unit_factor(time.get("unit", "s"), TIMES, "time", where)
+    time_plus = tuple(_time_plus(p, where) for p in tables(time, "plus", f"{where} time"))
+    if time_plus and any(f.time for f in files):
+        raise DataError("time.plus", where, "a time of each of [files] as well", "one time for all of them")
+    if files and source is not None and not time_plus and not any(source.startswith(f"{f.prefix}:") for f in files):
         # A column of every file: each has a clock of its own.
         files, source = tuple(f if f.time else replace(f, time=source, time_factor=factor) for f in files), None
     clocks = [f.time is not None for f in files]
@@ -184,10 +198,25 @@ def read_map(path: str | Path, ratios: np.ndarray) -> LogMap:
         excited_lines=tuple(lines),
         roles={k: choice(roles, k, where, ROLES) for k in roles},
         split=number(data, "split", where, low=0.05, high=0.95) if "split" in data else None,
+        whole=not shipped,  # of published logs any may be at hand
+        time_plus=time_plus,
     )
 
 
+def _known(table: dict, keys: set[str], start: str, where: str) -> None:
+    """Raise a DataError where a table has a key that nothing reads: a misspelt one would count for nothing."""
+    stray = set(table) - keys
+    if stray:
+        raise DataError(f"{start}{min(stray)}", where, "an unknown key", f"one of {sorted(keys)}")
+
+
+def _time_plus(entry: dict, where: str) -> tuple[str, float]:
+    _known(entry, TIME_PLUS_KEYS, "time.plus.", where)
+    return text(entry, "source", f"{where} time.plus"), unit_factor(entry.get("unit", "s"), TIMES, "time.plus", where)
+
+
 def _part(entry: dict, where: str) -> Part:
+    _known(entry, PART_KEYS, "multisine.part.", where)
     first = whole(entry, "first", where, low=1)
     last = whole(entry, "last", where, low=first)
     return Part(first, last, choice(entry, "role", where, ROLES, "identification"))
@@ -198,24 +227,19 @@ def _file(prefix: str, entry: Any, where: str) -> FilePart:
         entry = {"name": entry}
     if not isinstance(entry, dict):
         raise DataError(f"files.{prefix}", where, show(entry), '"name of a file" or { name = "...", width = 7, time = "t", unit = "s" }')
+    _known(entry, FILE_KEYS, f"files.{prefix}.", where)
     here = f"{where} files.{prefix}"
     return FilePart(
         prefix,
         text(entry, "name", here),
         whole(entry, "width", here, low=1, default=None),
         text(entry, "time", here) if "time" in entry else None,
-        _unit(entry.get("unit", "s"), f"files.{prefix}", where),
+        unit_factor(entry.get("unit", "s"), TIMES, f"files.{prefix}", where),
         number(entry, "shift", here, default=0.0),
     )
 
 
-def _unit(unit: Any, key: str, where: str) -> float:
-    if not isinstance(unit, str) or unit not in UNITS:
-        raise DataError(f"unit of {key}", where, show(unit), f"one of {list(UNITS)}")
-    return UNITS[unit]
-
-
-def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
+def _column(key: str, entry: Any, ratios: np.ndarray, linear: np.ndarray, where: str) -> Column:
     match = COLUMN.match(key)
     if match is None or int(match[2]) > len(ratios):
         raise DataError("column", where, key, f"tau_, q_, qd_, r_, q_ref_, q_link_ or temp_ and 1 to {len(ratios)}")
@@ -223,16 +247,18 @@ def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
         entry = {"source": entry}
     if not isinstance(entry, dict) or not isinstance(entry.get("source"), str):
         raise DataError(key, where, show(entry), '{ source = "name in the log", unit = "..." }')
-    stray = set(entry) - OPTIONS
-    if stray:
-        raise DataError(f"{key}.{min(stray)}", where, "an unknown option", f"one of {sorted(OPTIONS)}")
+    _known(entry, OPTIONS, f"{key}.", where)
     channel, joint = match[1], int(match[2]) - 1
     here = f"{where} {key}"
-    factor = _unit(entry.get("unit", "N m" if channel in ("tau", "r") else "rad"), key, where)
+    motor = choice(entry, "side", here, ("link", "motor"), "link") == "motor"
+    allowed = units_of(channel, bool(linear[joint]), "gear" in entry or (motor and bool(linear[joint])))
+    factor = unit_factor(entry["unit"], allowed, key, where) if "unit" in entry else 1.0
+    if number(entry, "sign", here, default=1.0) not in (-1.0, 1.0):
+        raise DataError(f"{key}.sign", where, show(entry["sign"]), "1 or -1 (scale multiplies)")
     for option in ("sign", "scale", "torque_constant"):
         factor *= number(entry, option, here, default=1.0)
     turn = 2 * np.pi / abs(factor) if factor else None
-    ratio = ratios[joint] if choice(entry, "side", here, ("link", "motor"), "link") == "motor" else 1.0
+    ratio = ratios[joint] if motor else 1.0
     ratio = number(entry, "gear", here, default=float(ratio))
     if ratio == 0 or factor == 0:
         raise DataError(key, where, "a factor of zero", "gear, sign, scale and torque_constant other than zero")
@@ -243,16 +269,16 @@ def _column(key: str, entry: Any, ratios: np.ndarray, where: str) -> Column:
     unwrap = entry.get("unwrap", False)
     if not isinstance(unwrap, bool):
         raise DataError(f"{key}.unwrap", where, show(unwrap), "true or false")
+    plus = tables(entry, "plus", here)
+    for p in plus:
+        _known(p, PLUS_KEYS, f"{key}.plus.", where)
     return Column(
         channel,
         joint,
         entry["source"],
         factor,
         number(entry, "offset", here, default=0.0),
-        whole(entry, "index", here, low=0, default=joint),
+        whole(entry, "index", here, low=0, default=None),
         turn if unwrap else None,
-        tuple(
-            (text(p, "source", here), number(p, "factor", here), whole(p, "index", here, low=0, default=joint))
-            for p in tables(entry, "plus", here)
-        ),
+        tuple((text(p, "source", here), number(p, "factor", here), whole(p, "index", here, low=0, default=None)) for p in plus),
     )

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Set
+import re
+from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet
 
 from ident.convert.dates import as_dates, dates_of_texts, seconds
-from ident.convert.texts import distinct, read_text, text_units
+from ident.convert.layout import read_layout
+from ident.convert.texts import MOST_CELLS, distinct, read_text, scan_text, text_names, text_units
 from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
 DEEPEST = 8  # structures inside structures that are looked into
 MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
 MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
+NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
 Signals = dict[str, np.ndarray]
+Reader = Callable[[Path, set[str] | None], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -30,11 +35,15 @@ class Survey:
         signals: name -> numbers; of dates the seconds since the first.
         units: name -> unit as the log writes it, where it does.
         dates: names of those that are dates or times of the day.
+        doubts: name -> what is doubtful about how it was read, in words; of those left out as well.
+        cut: rows that were read of a log that is longer; else 0.
     """
 
     signals: Signals
     units: dict[str, str]
     dates: frozenset[str]
+    doubts: dict[str, str]
+    cut: int = 0
 
 
 def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Signals:
@@ -50,7 +59,7 @@ def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Sig
     out = {}
     for name in sorted(wanted):
         if name not in data:
-            known = sorted(list_signals(path))
+            known = sorted(NAMES.get(path.suffix.lower(), list_signals)(path))
             raise DataError("signal", str(path), f"no {name}", f"one of {known[:30]}")
         x = _array(data[name])
         if x is None or x.dtype.kind not in ("fiuMm" if name in times else "fiu"):
@@ -66,17 +75,34 @@ def survey_log(path: Path) -> Survey:
         DataError: where the file is missing, of another format or unreadable.
     """
     signals: Signals = {}
-    dates = set()
-    for name, value in _read(path, None).items():
+    dates, doubts = set(), {}
+    rows = [0]
+    text = READERS.get(path.suffix.lower()) is read_text
+    for name, value in (_read(path, None, lambda p, _: _surveyed(p, doubts, rows)) if text else _read(path, None)).items():
         x = _array(value)
         if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
         if x.dtype.kind in "Mm":
             dates.add(name)
-            x = seconds(x, x.ravel()[0]) if x.size else x
+            stamps = x.ravel()[~np.isnat(x.ravel())]
+            x = seconds(x, stamps[0]) if len(stamps) else np.zeros(0)
         signals[name] = x.astype(float)
-    units = text_units(path) if READERS[path.suffix.lower()] is read_text else {}
-    return Survey(signals, units, frozenset(dates))
+    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0])
+
+
+def _surveyed(path: Path, doubts: dict[str, str], rows: list[int]) -> dict[str, Any]:
+    """Signals of a text, and what is doubtful about them; rows read of one that is longer."""
+    if not read_layout(path).names:
+        return read_text(path, None)
+    cells = scan_text(path, None)
+    if cells and cells[0].rows * len(cells) > MOST_CELLS:
+        rows[0] = cells[0].rows
+    for c in cells:
+        if c.fault is not None:
+            doubts[c.name] = f"{c.fault[1][:40]!r} in row {c.fault[0]}"
+        elif c.order[1]:
+            doubts[c.name] = f"{c.like!r} taken as {'month/day' if c.order[0] == 'mdy' else 'day-month'}"
+    return {c.name: x for c in cells if (x := c.array()) is not None}
 
 
 def list_signals(path: Path) -> Signals:
@@ -96,23 +122,34 @@ def _array(value: Any) -> np.ndarray | None:
 def _instead(x: np.ndarray | None) -> str:
     """What stands there, in words, where that can be told."""
     kind = "" if x is None else x.dtype.kind
-    return {"b": " but of true and false", "M": " but of dates", "m": " but of times", "U": " but of texts"}.get(kind, "")
+    if kind == "O" and x is not None and x.size == 1 and x.item() is None:  # as ``_lists`` gives them
+        return " but of lists of several lengths"
+    if kind == "O" and x is not None and all(isinstance(v, str) for v in x.ravel()[:10]):
+        kind = "U"
+    return {
+        "b": " but of true and false", "M": " but of dates", "m": " but of times", "U": " but of texts", "S": " but of texts",
+        "V": " but of structures", "c": " but of complex numbers", "O": " but of objects",
+    }.get(kind, "")  # fmt: skip
 
 
-def _read(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    """Signals of a file; None wants them all."""
+def _read(path: Path, wanted: set[str] | None, by: Reader | None = None) -> dict[str, Any]:
+    """Signals of a file; None wants them all. ``by``: another reader than that of its suffix."""
     if not path.is_file():
         raise DataError("log", str(path), "no such file", f"a file of {FORMATS}")
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise DataError("log", str(path), path.suffix or "no suffix", f"one of {FORMATS}")
     try:
-        return reader(path, wanted)
+        return (by or reader)(path, wanted)
     except DataError:
         raise
     except Exception as err:  # each reader raises types of its own for damaged files
-        reason = str(err).splitlines()[0][:160] if str(err) else type(err).__name__
-        raise DataError("log", str(path), f"unreadable ({reason})", "a complete file") from err
+        raise DataError("log", str(path), f"unreadable ({_reason(err)})", "a complete file") from err
+
+
+def _reason(err: Exception) -> str:
+    """The first line of an error, without the address of a Python object."""
+    return re.sub(r"<[^<>]* at 0x[0-9a-f]+>", "the file", str(err)).splitlines()[0][:160] if str(err).strip() else type(err).__name__
 
 
 def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
@@ -120,23 +157,55 @@ def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     schema = file.schema_arrow
     distinct(schema.names, wanted, path)
     names = [n for n in schema.names if (wanted is None or n in wanted) and _holds_numbers(schema.field(n).type)]
-    check_size(path, 8 * file.metadata.num_rows * len(names))
+    stored = 0
+    for g in range(file.metadata.num_row_groups):
+        columns = (file.metadata.row_group(g).column(k) for k in range(file.metadata.num_columns))
+        stored += sum(c.num_values for c in columns if c.path_in_schema.split(".")[0] in names or c.path_in_schema in names)
+    check_size(path, 8 * max(stored, file.metadata.num_rows * len(names)))
     table = file.read(columns=names)
-    return {n: as_dates(table.column(n)) for n in table.column_names}
+    out = {n: _lists(table.column(n)) if _is_list(table.column(n).type) else as_dates(table.column(n)) for n in table.column_names}
+    return {n: x for n, x in out.items() if x is not None or wanted is not None}
+
+
+def _lists(column: pa.ChunkedArray) -> np.ndarray | None:
+    """(N, k) of lists of k numbers each, as messages of all joints are kept; None where they are of several lengths."""
+    lengths = pc.list_value_length(column)
+    k = pc.min(lengths).as_py()
+    if column.null_count or not k or pc.max(lengths).as_py() != k:
+        return None
+    return as_dates(pc.list_flatten(column)).reshape(-1, k)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
 
 
 def _holds_numbers(kind: pa.DataType) -> bool:
-    """Whether values of a type are numbers, dates, or texts that may be dates."""
+    """Whether values of a type are numbers, lists of them, dates, or texts that may be dates."""
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
-    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_temporal, pa.types.is_string, pa.types.is_large_string)
-    return any(test(kind) for test in tests)
+    if _is_list(kind):
+        return any(test(kind.value_type) for test in NUMBERS)
+    return any(test(kind) for test in (*NUMBERS, pa.types.is_boolean, pa.types.is_temporal, pa.types.is_string, pa.types.is_large_string))
 
 
 def _npz(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     check_zip(path, wanted)
+    out = {}
     with np.load(path, allow_pickle=False) as file:
-        return {n: file[n] for n in file.files if wanted is None or n in wanted}
+        distinct([name.removesuffix(".npy") for name in file.zip.namelist()], wanted, path)
+        for name in file.files:
+            if wanted is not None and name not in wanted:
+                continue
+            try:
+                out[name] = file[name]
+            except ValueError as err:
+                if wanted is None:  # one that no one may want
+                    continue
+                objects = "Object arrays" in str(err)
+                found = f"{name} is an array of Python objects" if objects else f"{name} is unreadable ({_reason(err)})"
+                raise DataError("signal", str(path), found, "an array of numbers") from err
+    return out
 
 
 def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
@@ -229,8 +298,13 @@ def _db3(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return read_db3(path, wanted)
 
 
-READERS: dict[str, Callable[[Path, set[str] | None], dict[str, Any]]] = {
+READERS: dict[str, Reader] = {
     ".csv": read_text, ".txt": read_text, ".dat": read_text, ".tsv": read_text, ".parquet": _parquet, ".mat": _mat, ".npz": _npz,
     ".mcap": _mcap, ".db3": _db3,
 }  # fmt: skip
 FORMATS = tuple(READERS)
+# Names of signals of formats that tell them without being read; of others ``list_signals``.
+NAMES: dict[str, Callable[[Path], Iterable[str]]] = {
+    ".parquet": lambda path: pa.parquet.read_schema(path).names,
+    **{suffix: text_names for suffix, reader in READERS.items() if reader is read_text},
+}

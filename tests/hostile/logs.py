@@ -133,7 +133,13 @@ def tables() -> Iterator[Case]:
         return log(id_, ".parquet", lambda p: pq.write_table(pa.table(x | kwargs), p), outcome)
 
     n = sound.N
-    yield table("lists", x1=pa.array([[1.0]] * n))
+    yield table("lists of lengths", x1=pa.array([[1.0] * (1 + k % 2) for k in range(n)]))
+    yield table("lists of texts", x1=pa.array([["a"]] * n))
+    yield table("lists without numbers", x1=pa.array([[]] * n, pa.list_(pa.float64())))
+    yield table("lists with a gap", x1=pa.array([None, *[[1.0]] * (n - 1)]))
+    yield table("lists of nothing", x1=pa.array([[None]] * n, pa.list_(pa.float64())))
+    yield table("lists of lists", x1=pa.array([[[1.0]]] * n))
+    yield table("lists", x1=pa.array([[1.0]] * n), outcome=ACCEPTED)  # of as many joints as the arm has
     yield table("structures", x1=pa.array([{"a": 1.0}] * n))
     yield table("bytes", x1=pa.array([b"1"] * n))
     yield table("nulls", x1=pa.array([None] * n, pa.float64()))

@@ -1,0 +1,143 @@
+"""The cells of one column of a text as numbers or dates, taken batch by batch as the text is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from ident.convert.dates import DATE, date_order, is_date, parse_dates
+from robot_assets.errors import DataError
+
+NUMBER = r"(?i)^\s*([+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|[+-]?nan|)\s*$"
+THOUSANDS = r"^\s*[+-]?[1-9]\d?\d?(,\d\d\d)+\s*$"
+SEVERAL_COMMAS = r",.*,"
+
+
+class Cells:
+    """One column while it is read; what is kept of it is numbers, however long its texts are.
+
+    Attributes:
+        kind: "numbers", "dates" or "texts"; empty as long as all cells were. rows: taken.
+        order: of year, month and day in its dates, and whether it is a guess.
+        fault: (row from 1, text) of the first that is none like those above it.
+    """
+
+    def __init__(self, name: str, path: Path, wanted: bool, quoted: bool) -> None:
+        """``wanted``: whether a text is an error. ``quoted``: whether a comma within a cell stood in quotes."""
+        self.name, self.path, self.wanted, self.quoted = name, path, wanted, quoted
+        self.kind, self.rows, self.like, self.order = "", 0, "", ("ymd", False)
+        self.comma = self.dot = False
+        self.fault: tuple[int, str] | None = None
+        self._parts: list[np.ndarray] = []
+
+    def take(self, column: pa.Array) -> None:
+        """Take the next cells.
+
+        Raises:
+            DataError: where one that is wanted is no number and no date, with its row.
+        """
+        if not self.kind and column.null_count < len(column):
+            self.like = _text(column.drop_null()[0]).strip()
+            self.kind = "dates" if is_date(self.like) else "numbers"
+            self.order = date_order(column) if self.kind == "dates" else self.order
+        if self.kind != "texts":
+            try:
+                part = self._dates(column) if self.kind == "dates" else self._numbers(column)
+                self._parts.append(part)
+            except (pa.ArrowInvalid, ValueError):
+                self._refuse(column)
+        self.rows += len(column)
+
+    def array(self) -> np.ndarray | None:
+        """(N,) what was taken; None where it was texts, or nothing."""
+        if not self.kind or self.kind == "texts":
+            return None
+        parts, self._parts = self._parts, []
+        if self.kind == "dates":  # empty cells above the first
+            other = next(p.dtype for p in parts if p.dtype.kind in "Mm")
+            parts = [p if p.dtype.kind in "Mm" else np.full(len(p), "NaT", other) for p in parts]
+        return np.concatenate(parts)
+
+    def _dates(self, column: pa.Array) -> np.ndarray:
+        order = date_order(column) if self.order[1] else self.order
+        if not order[1] and order[0] != self.order[0] and DATE.match(self.like):
+            raise ValueError("another order of day and month than above")
+        self.order = order
+        return parse_dates(column, self.like, self.order)
+
+    def _numbers(self, column: pa.Array) -> np.ndarray:
+        if not self.comma:
+            try:
+                out = _cast(column)
+                self.dot = self.dot or bool(pc.any(pc.match_substring(column, ".")).as_py())
+                return out
+            except pa.ArrowInvalid:
+                pass
+        # A comma is the decimal sign where no point is; in quotes it may also part thousands.
+        if self.dot or pc.any(pc.match_substring(column, ".")).as_py() or pc.any(pc.match_substring_regex(column, SEVERAL_COMMAS)).as_py():
+            raise ValueError("both signs")
+        commas = column.filter(pc.match_substring(column, ",").fill_null(False))
+        if self.quoted and not self.comma and len(commas) and pc.all(pc.match_substring_regex(commas, THOUSANDS)).as_py():
+            raise ValueError("thousands")
+        out = _cast(pc.replace_substring(column, ",", "."))
+        self.comma = True
+        return out
+
+    def _refuse(self, column: pa.Array) -> None:
+        """Of cells that are not all like those above: an error, or texts; a few among numbers are none, and told."""
+        if self.kind == "dates":
+            cells = [_text(x).strip() for x in column]
+            bad = np.array([c != "" and (not is_date(c) or bool(DATE.match(c)) != bool(DATE.match(self.like))) for c in cells])
+            if not np.any(bad):
+                bad[self._no_date(column)] = True
+        else:
+            plain = pc.replace_substring(column, ",", ".") if self.comma or (not self.dot and not self.quoted) else column
+            bad = ~pc.match_substring_regex(plain, NUMBER).fill_null(True).to_numpy(zero_copy_only=False)
+        index = int(np.argmax(bad))
+        row, text = self.rows + index + 1, _text(column[index]).strip()
+        first = text == self.like and not any(np.any(~np.isnan(p)) for p in self._parts)
+        self.fault = self.fault or (row, text)
+        if not self.wanted and self.kind == "numbers" and not first and 2 * bad.sum() < len(column) - column.null_count:
+            self._parts.append(_cast(pc.if_else(pa.array(~bad), plain, pa.scalar(None, plain.type))))
+            return
+        kind, self.kind = self.kind, "texts"
+        self._parts = []
+        if not self.wanted:
+            return
+        if kind == "dates":
+            raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "dates that exist, all written in one way")
+        if first:
+            what = "true and false" if text.lower() in ("true", "false") else f"texts: {text[:60]!r} in row {row}"
+            raise DataError("signal", str(self.path), f"{self.name} is no array of numbers but of {what}", "numbers")
+        if text == self.name:
+            raise DataError("signal", str(self.path), f"the header again in row {row}", "one log: cut the file in two there")
+        raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "numbers")
+
+    def _no_date(self, column: pa.Array) -> int:
+        """The first that is written as a date, but is none of the calendar: the first half with one, halved again."""
+        low, high = 0, len(column)
+        while high - low > 1:
+            middle = (low + high) // 2
+            try:
+                parse_dates(column.slice(low, middle - low), self.like, self.order)
+                low = middle
+            except pa.ArrowInvalid:
+                high = middle
+        return low
+
+
+def _cast(column: pa.Array) -> np.ndarray:
+    try:
+        out = column.cast(pa.float64())
+    except pa.ArrowInvalid:
+        texts = pc.utf8_trim_whitespace(column)
+        out = pc.if_else(pc.equal(texts, ""), pa.scalar(None, texts.type), texts).cast(pa.float64())
+    return out.to_numpy(zero_copy_only=False)
+
+
+def _text(cell: pa.Scalar) -> str:
+    """A cell whose bytes may be those of another encoding."""
+    return "" if not cell.is_valid else cell.cast(pa.binary()).as_py().decode("utf-8", errors="replace")

@@ -1,0 +1,169 @@
+"""How a text with a table of numbers is laid out: comments, a header, a row of units, then rows; or rows alone."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import itertools
+import re
+from collections import deque
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from ident.convert.dates import is_date
+from ident.convert.spelling import unit_of
+from robot_assets.errors import DataError
+
+LOOKED_AT = 100  # lines that say how the table is laid out
+MOST_LOOKED_AT = 1 << 22  # characters of them
+MOST_COMMENTS = 100_000  # lines before the header
+LONGEST_LINE = 1 << 20  # characters of one
+NONE = ("na", "n/a", "#n/a", "null")
+ENCODING_BYTES = 1 << 16  # of a text that say how it is encoded
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a text is laid out.
+
+    Attributes:
+        encoding: of Python. delimiter: one character, or None for blanks.
+        names: of the columns; empty where no line says them. units: as written below the names, or empty.
+        start: lines before the first row. columns: of a row.
+    """
+
+    encoding: str
+    delimiter: str | None
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    start: int
+    columns: int
+
+
+def read_layout(path: Path) -> Layout:
+    """Look at the first lines of a text.
+
+    Raises:
+        DataError: where a line is too long for a table.
+    """
+    encoding = _encoding(path)
+    comments: deque[str] = deque(maxlen=2)
+    skipped, looked_at = 0, 0
+    with path.open(encoding=encoding, errors="replace", newline=None) as file:
+        line = file.readline(LONGEST_LINE)
+        while line and _comment(line) and skipped < MOST_COMMENTS:
+            comments.append(line)
+            skipped += 1
+            line = file.readline(LONGEST_LINE)
+        rows = [line]
+        while line and len(rows) <= LOOKED_AT and looked_at < MOST_LOOKED_AT:
+            line = file.readline(LONGEST_LINE)
+            looked_at += len(line)
+            rows.append(line)
+    rows = [r for r in rows if r]
+    if any(len(r) >= LONGEST_LINE for r in (*comments, *rows)):
+        raise DataError("log", str(path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
+    above = _header(rows)
+    comments.extend(r for r in rows[:above] if _comment(r))
+    rows, skipped = rows[above:], skipped + above
+    first = rows[0] if rows else ""
+    delimiter = _delimiter(first, rows[1] if len(rows) > 1 else first)
+    words = _words(first, delimiter)
+    names, units, start = words, (), skipped
+    # A header may be a comment itself: "# t q tau", above "# s rad Nm"; its row may hold texts, "%time,name,q" those of ROS.
+    said = [w for w in (_words(c.lstrip("#% \t"), delimiter) for c in comments) if len(w) == len(words) and not any(map(_value, w))]
+    if _row(words) or (said and len(words) > 1 and any(map(_value, words))):
+        units = said.pop() if len(said) == 2 and _units(said[1]) else ()
+        names = said[-1] if said else ()
+    else:
+        below = _words(rows[1], delimiter) if len(rows) > 2 and _row(_words(rows[2], delimiter)) else ()
+        units = below if len(below) == len(words) and _units(below) else ()
+        start += 1 + bool(units)
+    columns = len(words)
+    written = [w for r in rows[start - skipped :][:-1] if not _comment(r) and any(w := _words(r, delimiter))]
+    if names and written and all(_as_many(len(names), w) for w in written):
+        columns = len(written[0])  # a delimiter may stand at the end of rows, or of the header, alone
+        names = (*names, "")[:columns]
+    return Layout(encoding, delimiter, names, units, start, columns)
+
+
+def _header(rows: list[str]) -> int:
+    """The line from which on all lines have as many words: programs write a preamble of lines of their own above it."""
+
+    @cache
+    def words(k: int, delimiter: str | None) -> tuple[str, ...]:
+        return _words(rows[k], delimiter)
+
+    full = [k for k, r in enumerate(rows) if not _comment(r)]
+    for i, (k, below) in enumerate(itertools.pairwise(full)):
+        delimiter = _delimiter(rows[k], rows[below])
+        names, rest = words(k, delimiter), [words(m, delimiter) for m in full[i + 1 :]]
+        if len(names) < 2 or (i and any(map(_value, names))) or not all(_as_many(len(names), w) for w in rest):
+            continue
+        head = rest[1] if _units(rest[0]) and len(rest) > 1 else rest[0]
+        if any(map(_value, head)) and all(_value(a) or not a for a, z in zip(head, rest[-1], strict=False) if _value(z)):
+            return k
+    return 0
+
+
+def _as_many(n: int, words: tuple[str, ...]) -> bool:
+    """Whether a row has ``n`` words, or one more or less that is empty: a delimiter may stand at the end of either."""
+    return len(words) == n or (len(words) == n + 1 and not words[-1]) or len(words) == n - 1
+
+
+def _encoding(path: Path) -> str:
+    """Of a text: UTF-16 by its mark, else UTF-8, or Latin-1 where it is none."""
+    with path.open("rb") as file:
+        head = file.read(ENCODING_BYTES)
+    if head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8-sig"
+
+
+def _comment(line: str) -> bool:
+    """Whether a line before the header says nothing: a comment, a blank one, or the delimiter, as spreadsheets have it."""
+    start = line.lstrip()
+    return not start or start[0] in "#%" or start.lower().startswith("sep=")
+
+
+def _delimiter(first: str, second: str) -> str | None:
+    """Of a header and the row below; None for blanks."""
+    there = [c for c in ";\t," if c in first]
+    if there:
+        # A name may hold a comma, in the quotes that spreadsheets put about it, and so may numbers without names.
+        return max(there, key=lambda c: (len(_words(first, c)) == len(_words(second, c)), c != ",", first.count(c)))
+    return None if second.split()[1:] or first.split()[1:] else ","
+
+
+def _words(line: str, delimiter: str | None) -> tuple[str, ...]:
+    """Of one line, without quotes; a comment that is a header loses its sign."""
+    line = line.strip(" \r\n") if delimiter == "\t" else line.strip()
+    if delimiter is None:
+        words = [m[1] or m[2] or m[3] or "" for m in re.finditer(r"\"([^\"]*)\"|'([^']*)'|(\S+)", line)]
+    else:
+        words = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    return tuple(w.strip().strip("\"'").strip() for w in words)
+
+
+def _row(words: tuple[str, ...]) -> bool:
+    """Whether words are a row of numbers, and dates, rather than names."""
+    return any(words) and all(_value(w) for w in words if w)
+
+
+def _value(word: str) -> bool:
+    """Whether a word is a number, a date, or says that there is none."""
+    try:
+        float(word.replace(",", "."))
+    except ValueError:
+        return is_date(word) or word.lower() in NONE
+    return True
+
+
+def _units(words: tuple[str, ...]) -> bool:
+    """Whether words are units: one is known, and none is a number."""
+    return any(unit_of(w.strip("[](){}<> ")) for w in words) and not any(_value(w) for w in words if w)

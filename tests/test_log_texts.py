@@ -1,0 +1,155 @@
+"""Texts of numbers: cells that are none are named with their row, what no one needs stops nothing, and memory is bounded."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ident.cli import main
+from ident.convert import convert_logs
+from ident.convert.guess import guess_map
+from ident.convert.reading import list_signals, read_log, survey_log
+from robot_assets.errors import DataError
+
+N = 3000
+X = np.round(np.sin(np.arange(N) / 50.0), 6)
+MAP = 'sample_rate = 100.0\n[columns]\ntau_1 = "u"\nq_1 = "x"\n'
+
+
+def written(folder, rows, header="u,x", above="", name="log.csv"):
+    (folder / name).write_text(f"{above}{header}\n" + "".join(f"{r}\n" for r in rows), encoding="utf-8")
+    return folder / name
+
+
+def rows(change=lambda k, row: row, delimiter=","):
+    return [change(k, delimiter.join((f"{X[k]}", f"{-X[k]}"))) for k in range(N)]
+
+
+def converted(log):
+    (log.parent / "map.toml").write_text(MAP)
+    (s,) = convert_logs([log], "twomass", log.parent / "map.toml").segments
+    return s
+
+
+@pytest.mark.parametrize(
+    ("row", "cells", "found"),
+    [
+        (2000, "0.1,ERR", "x = 'ERR' in row 2001"),
+        (2000, "0.1,0x1237", "x = '0x1237' in row 2001"),
+        (2000, "u,x", "the header again in row 2001"),
+        (0, "0.1,on", "x is no array of numbers but of texts: 'on' in row 1"),
+        (2000, "0.1,0.2,0.3", r"found 3 columns in line 2002: '0\.1,0\.2,0\.3', expected 2 as in the rows above"),
+        (2000, '0.1,"1,5"', "x = '1,5' in row 2001"),  # points elsewhere: no decimal comma
+        (2000, "0.1,nan", r"q_1: .*log\.csv: found NaN of x at sample 2000 \(1 not finite in all\)"),
+        (2000, "inf,0.1", r"tau_1: .*log\.csv: found infinity of u at sample 2000"),
+        (2000, "0.1,1e40", r"q_1: .*log\.csv: found 1e\+40 of x at sample 2000"),
+    ],
+)
+def test_a_cell_that_cannot_be_used_is_named_with_its_row(tmp_path, row, cells, found):
+    log = written(tmp_path, rows(lambda k, text: cells if k == row else text))
+    with pytest.raises(DataError, match=found) as caught:
+        converted(log)
+    assert "\n" not in str(caught.value) and "log.csv" in str(caught.value)
+
+
+def test_decimal_commas_may_begin_late_and_stand_in_quotes(tmp_path):
+    x = np.where(np.arange(N) < 1500, np.round(X), X)
+    cells = [f"{v:g}".replace(".", ",") for v in x]
+    for log in (
+        written(tmp_path, [f"{c};{c}" for c in cells], "u;x", name="semicolons.csv"),
+        written(tmp_path, [f'"{c}","{c}"' for c in cells], name="quotes.csv"),
+        written(tmp_path, [f"{c}\t{c}" for c in cells], "u\tx", name="tabs.txt"),
+        written(tmp_path, [f" {c}   {c}" for c in cells], "u x", name="blanks.txt"),
+    ):
+        assert np.array_equal(converted(log).q[:, 0], np.array([float(f"{v:g}") for v in x])), log
+
+
+def test_commas_that_part_thousands_are_no_decimal_signs(tmp_path):
+    for cell in ("1,234", "1,234.5", "1,234,567"):
+        log = written(tmp_path, [f'5,"{cell}"'] * 50)
+        with pytest.raises(DataError, match=cell.replace(".", r"\.")):
+            converted(log)
+
+
+@pytest.mark.parametrize("cell", [lambda k: "" if k < 2500 else "STOP", lambda k: "0x1237", lambda k: "0" if k < 2500 else "E12", lambda k: "Größe", lambda k: ""])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_a_column_that_no_one_needs_stops_nothing(tmp_path, cell, encoding):
+    text = "u,x,event\n" + "\n".join(rows(lambda k, r: f"{r},{cell(k)}")) + "\n"
+    (tmp_path / "log.csv").write_bytes(text.encode(encoding))
+    survey = survey_log(tmp_path / "log.csv")
+    assert np.array_equal(survey.signals["x"], -X) and set(survey.signals) <= {"u", "x", "event"}
+    assert np.array_equal(converted(tmp_path / "log.csv").q[:, 0], -X)
+
+
+def test_a_damaged_cell_is_told_by_the_survey_which_keeps_its_column(tmp_path):
+    survey = survey_log(written(tmp_path, rows(lambda k, r: "0.1,ERR" if k == 2000 else r)))
+    assert survey.doubts == {"x": "'ERR' in row 2001"}
+    assert np.array_equal(np.flatnonzero(np.isnan(survey.signals["x"])), [2000])
+
+
+@pytest.mark.parametrize("above", ["Name;Scope\nFile;x.svdx\n\n", "Rate;1000\nCount;5\n\n", "a note\n# more\n", "# a comment\n" * 1100])
+def test_lines_of_a_program_above_the_header(tmp_path, above):
+    log = written(tmp_path, rows(delimiter=";"), "u;x", above)
+    assert np.array_equal(converted(log).tau[:, 0], X)
+
+
+@pytest.mark.parametrize(("header", "end"), [("u,x", ","), ("u,x,", ""), ("u,x,", ",")])
+def test_a_delimiter_at_the_end_of_rows_or_of_the_header(tmp_path, header, end):
+    assert np.array_equal(converted(written(tmp_path, rows(lambda k, r: r + end), header)).q[:, 0], -X)
+
+
+def test_a_header_that_is_a_comment_above_rows_with_texts(tmp_path):
+    log = written(tmp_path, [f"{k},joint1,{X[k]}" for k in range(N)], "%time,field.name0,field.position0")
+    assert sorted(list_signals(log)) == ["field.position0", "time"]
+    for name in ("%time", "time"):  # as the file has it, or without its sign
+        assert np.array_equal(read_log(log, {name, "field.position0"})[name], np.arange(N))
+
+
+def test_rows_of_blanks_with_comments_between(tmp_path):
+    text = "# nothing\n" + "".join(f"  {x}\t {2 * x}  \n" + ("# more\n" if k % 100 == 3 else "") for k, x in enumerate(X))
+    (tmp_path / "log.txt").write_text(text)
+    assert np.allclose(list_signals(tmp_path / "log.txt")["values"], np.stack([X, 2 * X], axis=1))
+    (tmp_path / "named.txt").write_text("u   x\n" + text.split("\n", 1)[1].replace("# more\n", ""))
+    assert np.allclose(converted(tmp_path / "named.txt").q[:, 0], 2 * X)
+
+
+@pytest.mark.parametrize("command", ["convert", "guess"])
+def test_texts_that_are_no_numbers_take_no_memory(tmp_path, command):
+    """A process of its own, since the memory that one has had does not shrink."""
+    (tmp_path / "log.csv").write_text("t,q1\n" + "abc,d\n" * 2_000_000)
+    (tmp_path / "map.toml").write_text(MAP)
+    what = {
+        "convert": f"from ident.convert import convert_logs as f; args = ([Path('{tmp_path}/log.csv')], 'twomass', '{tmp_path}/map.toml')",
+        "guess": f"from ident.convert.guess import guess_map as f; args = ([Path('{tmp_path}/log.csv')], 'twomass')",
+    }[command]
+    code = (
+        f"import resource\nfrom pathlib import Path\nfrom robot_assets.errors import DataError\n{what}\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\nbefore = peak()\n"
+        "try:\n    f(*args)\nexcept DataError as err:\n    print(err)\nprint(peak() - before)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    error, grown = run.stdout.strip().splitlines()
+    assert "log.csv" in error and int(grown) < 20_000, run.stdout  # KB, of a file of 12 MB
+
+
+def test_the_beginning_of_a_long_log_is_enough_for_a_guess(tmp_path, monkeypatch):
+    monkeypatch.setattr("ident.convert.texts.MOST_CELLS", 100_000)
+    monkeypatch.setattr("ident.convert.reading.MOST_CELLS", 100_000)
+    row = ["0.12345678,0.87654321", "0.2,0.1"]
+    log = written(tmp_path, row * 100_000, "torque_Nm,pos_rad")
+    survey = survey_log(log)
+    assert 50_000 < survey.cut < 150_000 and len(survey.signals["pos_rad"]) == survey.cut
+    assert guess_map([log], "twomass").warnings[-1] == f"log.csv: guessed from its first {survey.cut} rows"
+    assert len(read_log(log, {"pos_rad"})["pos_rad"]) == 200_000
+
+
+@pytest.mark.parametrize("quiet", [(), ("--quiet",), ("--json",)])
+def test_a_large_log_has_progress(tmp_path, monkeypatch, capfd, quiet):
+    (tmp_path / "map.toml").write_text(MAP)
+    args = ["simgap", "convert", str(written(tmp_path, rows())), "--robot", "twomass", "--map", str(tmp_path / "map.toml"), "--out", str(tmp_path / "d"), *quiet]
+    for size, told in ((1e3, not quiet), (1e9, False)):
+        monkeypatch.setattr("ident.cli.LARGE_LOG", size)
+        monkeypatch.setattr(sys, "argv", args)
+        main()
+        assert capfd.readouterr().err.splitlines() == (["reading log.csv", f"writing {tmp_path / 'd'}"] if told else [])
