@@ -137,8 +137,10 @@ def _check_mimics(joints: list[tuple[str, ET.Element]], path: Path) -> None:
     leads = {name: str(mimic.get("joint")) for name, e in joints if (mimic := e.find("mimic")) is not None}
     names = {name for name, _ in joints}
     for name, joint in joints:
-        for key, default in (("multiplier", "1"), ("offset", "0")) if (mimic := joint.find("mimic")) is not None else ():
-            _number(mimic.get(key, default), f"{key} of the mimic of joint {name}", path)
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            for key, default in (("multiplier", "1"), ("offset", "0")):
+                _number(mimic.get(key, default), f"{key} of the mimic of joint {name}", path)
     for name in leads:
         at, steps = name, 0
         while at in leads and steps <= len(leads):

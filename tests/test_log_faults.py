@@ -77,7 +77,7 @@ def test_periods_that_are_held_out_are_not_fitted_to(tmp_path):
             assert [s.role for s in convert_logs([log], "twomass", given).segments] == ["validation", "identification"]
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16", "utf-16-le", "utf-16-be"])
 @pytest.mark.parametrize(("delimiter", "decimal"), [(";", ","), ("\t", ","), ("\t", "."), (",", ".")])
 def test_texts_of_other_encodings_and_decimal_signs(tmp_path, encoding, delimiter, decimal):
     rows = [("Winkel [°]", "Moment [Nm]"), ("0", "1"), ("1.5", "-2.25"), ("2", "3e-2"), *[("4", "5")] * 20]

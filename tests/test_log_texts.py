@@ -65,6 +65,16 @@ def test_decimal_commas_may_begin_late_and_stand_in_quotes(tmp_path):
         assert np.array_equal(converted(log).q[:, 0], np.array([float(f"{v:g}") for v in x])), log
 
 
+def test_exponents_of_fortran(tmp_path):
+    log = written(tmp_path, [f" {x:.6e}".replace("e", "D") + f",{-x:.6e}".replace("e", "d") for x in X])
+    assert np.array_equal(converted(log).q[:, 0], -X)
+
+
+def test_a_log_of_texts_alone_is_said_to_be(tmp_path):
+    with pytest.raises(DataError, match=r"no signal of 20 samples or more \(u has 'a' in row 1\)"):
+        guess_map([written(tmp_path, ["a,b"] * 100)], "twomass")
+
+
 def test_commas_that_part_thousands_are_no_decimal_signs(tmp_path):
     for cell in ("1,234", "1,234.5", "1,234,567"):
         log = written(tmp_path, [f'5,"{cell}"'] * 50)

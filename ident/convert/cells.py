@@ -11,8 +11,9 @@ import pyarrow.compute as pc
 from ident.convert.dates import DATE, date_order, is_date, parse_dates
 from robot_assets.errors import DataError
 
-NUMBER = r"(?i)^\s*([+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|[+-]?nan|)\s*$"
+NUMBER = r"(?i)^\s*([+-]?(\d+\.?\d*|\.\d+)([ed][+-]?\d+)?|[+-]?inf(inity)?|[+-]?nan|)\s*$"
 THOUSANDS = r"^\s*[+-]?[1-9]\d?\d?(,\d\d\d)+\s*$"
+FORTRAN = r"^([+-]?[0-9.]+)[dD]([+-]?[0-9]+)$"  # an exponent of its double precision
 SEVERAL_COMMAS = r",.*,"
 
 
@@ -133,7 +134,7 @@ def _cast(column: pa.Array) -> np.ndarray:
     try:
         out = column.cast(pa.float64())
     except pa.ArrowInvalid:
-        texts = pc.utf8_trim_whitespace(column)
+        texts = pc.replace_substring_regex(pc.utf8_trim_whitespace(column), FORTRAN, r"\1e\2")
         out = pc.if_else(pc.equal(texts, ""), pa.scalar(None, texts.type), texts).cast(pa.float64())
     return out.to_numpy(zero_copy_only=False)
 

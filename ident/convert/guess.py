@@ -74,7 +74,8 @@ def guess_map(files: Sequence[Path], robot: str | Path, *, progress: Callable[[s
     signals = _on_one_clock(logs, clocks) if clocks else _joined(logs, parts) if parts else logs[0]
     lengths = [_length(x) for x in signals.values() if _length(x) >= SHORTEST]
     if not lengths:
-        raise DataError("log", str(paths[0]), f"no signal of {SHORTEST} samples or more", "columns of numbers")
+        why = next((f" ({name} has {text})" for name, text in doubts.items()), "")
+        raise DataError("log", str(paths[0]), f"no signal of {SHORTEST} samples or more{why}", "columns of numbers")
     # The log has the length at which most values stand.
     N = max(set(lengths), key=lambda k: sum(x.size for x in signals.values() if _length(x) == k))
     families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm)

@@ -86,12 +86,10 @@ def guess_scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate
 
 
 def _before_gear(torque: Family, unit: str, arm: Robot) -> bool:
-    """Whether torques are of the size that a motor has before its gear; currents tell nothing without their constant.
+    """Whether torques are of the size that a motor has before its gear.
 
     Between three hundredths of the limit and a little more than it is where torques of a log lie.
     """
-    if unit in ELECTRIC:
-        return False
     ratio, share = np.abs(arm.array("gear_ratio")), np.abs(torque.x * UNITS[unit]).max(axis=0) / arm.array("torque_limit")
     return bool(np.any(ratio > 3) and np.median(share) < 0.1 and 0.03 < np.median(share * ratio) < 3.0)
 
@@ -204,7 +202,7 @@ def _torque(family: Family, position: Family | None, scale: Scale | None, arm: R
     options, notes = [], [range_text(family.x)]
     if unit in ELECTRIC:
         options.append("torque_constant = 1.0")
-        notes.append(f"EDIT: the torque constant (side = \"motor\" where it is that before the gear), or the unit if this is a {'force' if np.all(linear) else 'torque'} after all")
+        notes.append(f"EDIT: the torque constant, the side that it is for, or the unit if this is a {'force' if np.all(linear) else 'torque'} after all")
     turned = np.broadcast_to(_turned(position), arm.n)
     before = _before_gear(family, unit, arm)
     if before and np.mean(turned) < 0.5:

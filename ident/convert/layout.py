@@ -118,6 +118,10 @@ def _encoding(path: Path) -> str:
         head = file.read(ENCODING_BYTES)
     if head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return "utf-16"
+    for start, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):  # without a mark: every other byte of a table is zero
+        half = head[start::2]
+        if len(half) > 8 and half.count(0) > 0.9 * len(half):
+            return encoding
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError:
@@ -158,7 +162,7 @@ def _row(words: tuple[str, ...]) -> bool:
 def _value(word: str) -> bool:
     """Whether a word is a number, a date, or says that there is none."""
     try:
-        float(word.replace(",", "."))
+        float(word.replace(",", ".").lower().replace("d", "e"))  # of Fortran as well
     except ValueError:
         return is_date(word) or word.lower() in NONE
     return True
