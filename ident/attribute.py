@@ -138,7 +138,7 @@ def attribute(
     if hypotheses is None:
         # In motions alone offsets of the torque are found with the inertias of the links, as part of the baseline.
         hypotheses = catalogue(problem.structure, offsets=not problem.motions_alone)
-    hypotheses = tuple(hypotheses)
+    every = hypotheses = tuple(hypotheses)
     p_value = p_detected = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
     loud = p_value < level and baseline.chi2_per_dof > DETECTION_EXCESS
@@ -194,6 +194,10 @@ def attribute(
         current = as_loops(problem, current, workers)
     current = without_shadows(problem, current, rounds, workers)
     current, rounds = weighed_again(problem, current, rounds, workers)
+    if any(plainly_special(e) for e in current.model.effects) and not workers.late:
+        effects = current.model.effects
+        current = plainer(problem, current, every, {e.hypothesis.key for e in effects if not plainly_special(e)})
+        rounds = renamed(rounds, effects, current.model.effects)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
@@ -521,7 +525,7 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
         if h.key in kept or special is None or "apart" not in h.options:
             return effect
         hidden = h.options.get("give", lambda p: np.inf)(effect.p) < problem.q_std[h.joint]
-        if std[h.coordinate(h.options['apart'])] < UNTOLD and not hidden:
+        if std[h.coordinate(h.options['apart'])] < UNTOLD and not hidden and not plainly_special(effect):
             return effect
         return Effect(special, clip_to_bounds(special, h.options["special"](effect.p)))
 
@@ -532,7 +536,14 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
     other = polish(problem, replace(result, model=replace(result.model, effects=effects)))
     same = reweighted(problem, result, other.weights)
     scale = max(1.0, same.cost / same.count)
-    return other if other.cost - same.cost < swapped * MIN_EVIDENCE * scale else result
+    # One that has reached what makes it its special case is that one, whatever errors of the law make of the rest.
+    certain = all(a is b or plainly_special(a) for a, b in zip(result.model.effects, effects, strict=True))
+    return other if certain or other.cost - same.cost < swapped * MIN_EVIDENCE * scale else result
+
+
+def plainly_special(effect: Effect) -> bool:
+    """Whether the parameters of an effect say that it is its special case."""
+    return bool(effect.hypothesis.options.get("plain", lambda p: False)(effect.p))
 
 
 def attribute_once(

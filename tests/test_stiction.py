@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from ident.attribute import plainly_special
 from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose, set_up
 from ident.extended import Effect, Model, predict
@@ -245,3 +246,10 @@ def test_rest_tells_nothing_of_a_friction_within_the_noise_of_what_is_asked():
         small = replace(model, effects=(replace(model.effects[0], p=np.array([size * noise, 0.0, 1e-4])),))
         still.append(held(predict(small, group, problem.sampling), group).mean())
     assert still[0] == 0.0 < still[1]
+
+
+def test_a_law_that_has_lost_what_sets_it_apart_is_its_special_case():
+    laws = {h.effect: h for h in catalogue(set_up(sticking()[0]).problem.structure)}
+    dips = [plainly_special(Effect(laws["stribeck_friction"], np.array([2.0, static, 0.01, 1e-3]))) for static in (1.7, 2.2, 2.4)]
+    assert dips == [True, True, False]
+    assert not plainly_special(Effect(laws["coulomb_friction"], np.array([2.0, 0.0, 1e-3])))
