@@ -33,7 +33,7 @@ from ident.graybox import (
     linearise,
 )
 from ident.mixing import mixed
-from ident.records import Group
+from ident.records import Group, signal_share
 from ident.recursion import chain_of, newton_euler
 
 REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder
@@ -222,14 +222,24 @@ class Motion:
         others = self.beside[..., joint] if isinstance(self.beside, np.ndarray) else self.beside
         given = self.group.U if self.delivered is None else self.delivered
         left = given[..., joint] - linear - carried - others
+        # What is cut off at the size of a friction mixes the noise of fast lines, where it is largest, into all.
+        left = signal_share(left, self._asked_noise(joint)) * left
         return self.group.to_time(left[..., None])[..., 0]
 
+    def turn_noise(self, joint: int) -> float:
+        """Standard deviation of the velocity that laws see, rad/s."""
+        power = self.group.omega[:, None] ** 2 * self.group.shown_error[..., joint].T
+        return float(np.sqrt(2.0 * np.mean(np.sum(power, axis=0))))
+
     def asked_noise(self, joint: int) -> float:
-        """Standard deviation of ``asked`` by noise of the samples of motor position and torque, N m; in the mean over records."""
+        """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean over records."""
+        return float(np.sqrt(2.0 * np.sum(self._asked_noise(joint))))
+
+    def _asked_noise(self, joint: int) -> np.ndarray:
+        """(L,) its variance, N2 m2."""
         group, s = self.group, 1j * self.group.omega
         gain = np.abs(s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) ** 2
-        power = np.sum(gain * group.white_noise[joint] + group.white_torque_noise[joint])
-        return float(np.sqrt(2.0 * power * np.mean(1.0 / group.periods)))
+        return (gain * group.white_noise[joint] + group.white_torque_noise[joint]) * np.mean(1.0 / group.periods)
 
     @property
     def time(self) -> np.ndarray:

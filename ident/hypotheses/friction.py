@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen
+from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.kernels import smooth_sign
 from ident.hypotheses.yielding import DAHL, bristle
 from ident.inverse import Motion
@@ -14,11 +14,13 @@ from ident.inverse import Motion
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
 REST_QUANTILE = 0.95  # of what a friction balances at rest, that says its size
+RESOLVED = 2.0  # velocity within which a friction turns over the noise of that which is seen, from which no rest is needed to know it
 SEEN = 3.0  # size of a friction over the noise of what is asked of it, below which rest tells nothing of it
 LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
 LEAST_DIP = 1.15  # static friction over Coulomb's, below which it is as good as that
+TURN_SHARE = 2e-3  # velocity within which a friction turns over that of its dip, at first
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
@@ -55,7 +57,7 @@ def dry(
     s = direction(motion.v(j), smoothing)
     moving = np.where(s > 0, size, back) * s
     rest = resting(motion, j)
-    if rest is None:
+    if rest is None or (motion.group.window is None and smoothing > RESOLVED * motion.turn_noise(j)):
         return moving
     largest = np.broadcast_to(np.maximum(np.abs(size), np.abs(back)), rest.shape)[rest].mean()
     if largest < SEEN * motion.asked_noise(j):
@@ -73,7 +75,7 @@ def dry(
 def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
     """Dry friction (S, T) over its size, of which the rest itself says one."""
     rest = resting(motion, j)
-    if rest is None:
+    if rest is None or (motion.group.window is None and smoothing > RESOLVED * motion.turn_noise(j)):
         return direction(motion.v(j), smoothing)
     size = np.quantile(np.abs(motion.asked(j)[rest]), REST_QUANTILE)
     if size < SEEN * motion.asked_noise(j):
@@ -96,6 +98,11 @@ def held_at_start(motion: Motion, j: int, size: float) -> np.ndarray | None:
         return None
     first = max(1, round(START_TIME / motion.time_step))
     return np.clip(motion.asked(j)[:, :first].mean(axis=1) / size, -1.0, 1.0)
+
+
+def turns(scale: SignalScale) -> list[tuple[float]]:
+    """Velocities within which a friction may turn, rad/s: at once, so that rest tells it where the motor sticks, or smoothly."""
+    return [(f * scale.v,) for f in (1e-5, 2e-3, 0.05)]
 
 
 def coulomb_friction(joint: int, place: str) -> Hypothesis:
@@ -123,7 +130,7 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
             SMOOTHING,
         ),
         law,
-        lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
+        turns,
         screen,
         "The residual torque of {joint} is a step in its velocity: a friction torque of {torque:.3g} N m"
         " against the motion whatever its speed.",
@@ -141,13 +148,13 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)
-        s = sense(motion, j, shape[0] * 0.02)
+        s = sense(motion, j, shape[0] * TURN_SHARE)
 
         def start(c):
             if c[0] + c[1] <= 0:
                 return None
             coulomb = max(c[0], 0.3 * (c[0] + c[1]))
-            return np.array([coulomb, max(c[0] + c[1], 1.3 * coulomb), shape[0], shape[0] * 0.02])
+            return np.array([coulomb, max(c[0] + c[1], 1.3 * coulomb), shape[0], shape[0] * TURN_SHARE])
 
         return Screen((s, s * np.exp(-((v / shape[0]) ** 2))), start, shape)
 
@@ -235,7 +242,7 @@ def load_dependent_friction(joint: int, place: str) -> Hypothesis:
         "motor",
         (Parameter("coefficient", "1", 1e-9, 2.0, log=True), SMOOTHING),
         lambda p, motion, j, k: dry(motion, j, p[1], p[0] * np.abs(motion.tau_s(j))),
-        lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
+        turns,
         screen,
         "The friction torque of {joint} is {coefficient:.3g} of the torque it transmits: it differs"
         " between postures as the load does.",
@@ -290,7 +297,14 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
         " of {time_constant:.0f} s.",
         variable="time",
-        options={"absorbs": "coulomb_friction", "absorb": absorb, "essential": ("relative_change",), "dry": True},
+        options={
+            "absorbs": "coulomb_friction",
+            "absorb": absorb,
+            "apart": "time_constant",
+            "special": lambda p: np.array([p[2], 0.0, p[3]]),
+            "essential": ("relative_change",),
+            "dry": True,
+        },
     )
 
 
@@ -373,7 +387,7 @@ def position_friction(joint: int, place: str) -> Hypothesis:
             SMOOTHING,
         ),
         law,
-        lambda scale: [(2e-3 * scale.v,), (0.05 * scale.v,)],
+        turns,
         lambda motion, j, k, shape: Screen(units(motion, j, shape[0]), lambda c: np.array([*c, shape[0]]), shape),
         "The residual torque of {joint} changes sign with direction, and its size with position.",
         options={
