@@ -55,9 +55,7 @@ def fit_baseline(
             best = min(best, again(replace(par, damping=damping)), key=lambda f: f.cost)
     lost = astray(problem, best)
     if best.chi2_per_dof > DETECTION_EXCESS and np.any(lost):
-        par, guess = best.model.par, problem.nominal
-        drives = {name: np.where(lost, getattr(guess, name), getattr(par, name)) for name in DRIVE}
-        other = again(replace(par, **drives))
+        other = again(begun_again(problem, best.model.par, lost))
         # Where they only go astray elsewhere they stand for what is missing.
         if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
             best = other
@@ -67,6 +65,11 @@ def fit_baseline(
     except NOT_COMPUTED:
         pass  # drives gone astray pass on noise without bounds
     return replace(best, softer=first.softer)
+
+
+def begun_again(problem: Problem, par: Parameters, lost: np.ndarray) -> Parameters:
+    """Parameters with the drives of some joints (n,) back at their starting guesses."""
+    return replace(par, **{name: np.where(lost, getattr(problem.nominal, name), getattr(par, name)) for name in DRIVE})
 
 
 def astray(problem: Problem, result: Fit) -> np.ndarray:

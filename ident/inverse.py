@@ -228,8 +228,7 @@ class Motion:
 
     def turn_noise(self, joint: int) -> float:
         """Standard deviation of the velocity that laws see, rad/s."""
-        power = self.group.omega[:, None] ** 2 * self.group.shown_error[..., joint].T
-        return float(np.sqrt(2.0 * np.mean(np.sum(power, axis=0))))
+        return float(np.sqrt(np.mean(self.group.velocity_error[:, joint] ** 2)))
 
     def asked_noise(self, joint: int) -> float:
         """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean over records."""

@@ -150,6 +150,16 @@ class Group:
         return np.maximum(mean, 0.0)
 
     @cached_property
+    def slow_velocity(self) -> np.ndarray:
+        """(S, n_time, n) motor velocity in lines 0..L-1, without those of noise alone, rad/s."""
+        return self.to_time(1j * self.omega[:, None] * self.signal_share * self.Q)
+
+    @cached_property
+    def velocity_error(self) -> np.ndarray:
+        """(S, n) by which that is off, rad/s rms."""
+        return np.sqrt(2.0 * np.sum(self.omega[:, None] ** 2 * self.shown_error, axis=1))
+
+    @cached_property
     def fast_velocity(self) -> np.ndarray | None:
         """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps; None of a motion."""
         if self.Q_fast is None:
@@ -479,10 +489,9 @@ def _slow(group: Group) -> np.ndarray:
 
     Positions may differ by no more than noise where a motor moves slowly, and its direction is known.
     """
-    v = group.to_time(1j * group.omega[:, None] * group.signal_share * group.Q)
-    off = np.sqrt(2.0 * np.sum(group.omega[:, None] ** 2 * group.shown_error, axis=1, keepdims=True))
+    v = group.slow_velocity
     usual = np.sqrt(np.mean(v**2, axis=1, keepdims=True))
-    return np.abs(v) < np.maximum(SURE * off, CREEPING * usual)
+    return np.abs(v) < np.maximum(SURE * group.velocity_error[:, None], CREEPING * usual)
 
 
 def _turning(group: Group) -> np.ndarray:
@@ -490,7 +499,7 @@ def _turning(group: Group) -> np.ndarray:
 
     Dry friction jumps there, and with it the acceleration: in a motion whose lines end the velocity turns too late.
     """
-    v = group.to_time(1j * group.omega[:, None] * group.signal_share * group.Q) + group.fast_velocity
+    v = group.slow_velocity + group.fast_velocity
     turns = v * np.roll(v, -1, axis=1) <= 0.0
     return turns | np.roll(turns, 1, axis=1)
 

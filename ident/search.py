@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, DRIVE, HOPELESS, astray, implausible
+from ident.baseline import DETECTION_EXCESS, HOPELESS, astray, begun_again, implausible
 from ident.evidence import explained, last_is_pointless
 from ident.extended import Effect, Model, Prediction, along_record, as_loop, has_rough_law, is_along_record
 from ident.hypotheses import Hypothesis
@@ -473,9 +473,7 @@ def recovered(problem: Problem, result: Fit) -> Fit:
         lost = astray(problem, result)
         if result.chi2_per_dof <= DETECTION_EXCESS or not np.any(lost):
             return result
-        par, guess = result.model.par, problem.nominal
-        drives = {name: np.where(lost, getattr(guess, name), getattr(par, name)) for name in DRIVE}
-        model = replace(result.model, par=replace(par, **drives))
+        model = replace(result.model, par=begun_again(problem, result.model.par, lost))
         other = anneal(problem, model, ladder=ANNEALING[-2:], iterations=STRONG_STEPS, gap=STRONG_GAP, remainders=result.remainders)
         if not other.cost < CLEARLY_BETTER * result.cost:
             return result

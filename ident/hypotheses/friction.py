@@ -56,8 +56,8 @@ def dry(
     back = size if back is None else back
     s = direction(motion.v(j), smoothing)
     moving = np.where(s > 0, size, back) * s
-    rest = resting(motion, j)
-    if rest is None or (motion.group.window is None and smoothing > RESOLVED * motion.turn_noise(j)):
+    rest = resting(motion, j, smoothing)
+    if rest is None:
         return moving
     largest = np.broadcast_to(np.maximum(np.abs(size), np.abs(back)), rest.shape)[rest].mean()
     if largest < SEEN * motion.asked_noise(j):
@@ -74,8 +74,8 @@ def dry(
 
 def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
     """Dry friction (S, T) over its size, of which the rest itself says one."""
-    rest = resting(motion, j)
-    if rest is None or (motion.group.window is None and smoothing > RESOLVED * motion.turn_noise(j)):
+    rest = resting(motion, j, smoothing)
+    if rest is None:
         return direction(motion.v(j), smoothing)
     size = np.quantile(np.abs(motion.asked(j)[rest]), REST_QUANTILE)
     if size < SEEN * motion.asked_noise(j):
@@ -83,10 +83,13 @@ def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
     return dry(motion, j, smoothing, size) / max(size, LEAST_TORQUE)
 
 
-def resting(motion: Motion, j: int) -> np.ndarray | None:
-    """Where a motor stands still (S, T); None where it never does, or that is not known."""
+def resting(motion: Motion, j: int, smoothing: float) -> np.ndarray | None:
+    """Where a motor stands still (S, T); None where it never does, that is not known, or a turn within ``smoothing`` rad/s is seen without."""
     rest = motion.group.rest
-    return None if rest is None or j in motion.told or not np.any(rest[..., j]) else rest[..., j]
+    if rest is None or j in motion.told or not np.any(rest[..., j]):
+        return None
+    seen = motion.group.window is None and smoothing > RESOLVED * motion.turn_noise(j)
+    return None if seen else rest[..., j]
 
 
 def held_at_start(motion: Motion, j: int, size: float) -> np.ndarray | None:
