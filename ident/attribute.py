@@ -31,10 +31,11 @@ from ident.evidence import (
     rivals_of_best,
     weigh,
 )
-from ident.extended import Effect, Model, is_along_record
+from ident.extended import Effect, Model, is_along_record, joints_along_record
 from ident.faint import SEEN, hidden
 from ident.hypotheses import Hypothesis, catalogue
 from ident.parallel import Workers
+from ident.records import Group
 from ident.screening import Score, screen, signal_scale
 from ident.search import (
     FAINT,
@@ -46,6 +47,7 @@ from ident.search import (
     STRONG,
     beside_strong,
     clip_to_bounds,
+    either_turn,
     explore,
     explore_softly,
     extended_by,
@@ -75,6 +77,7 @@ MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 LAWS_LEAVE = 1e-4  # of what causes explain at a joint, left there by errors of a hundredth in their laws: no other is sought loudly
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 SAME_PERIOD = 0.01  # relative, of two ripples
+NEXT_TO_REST = 2.0  # velocity over that at which a motor may as well rest, up to which friction may stand for what holds it then
 REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
 
 
@@ -194,9 +197,10 @@ def attribute(
         current = as_loops(problem, current, workers)
     current = without_shadows(problem, current, rounds, workers)
     current, rounds = weighed_again(problem, current, rounds, workers)
-    if any(plainly_special(e) for e in current.model.effects) and not workers.late:
-        effects = current.model.effects
-        current = plainer(problem, current, every, {e.hypothesis.key for e in effects if not plainly_special(e)})
+    effects = current.model.effects
+    itself = [e for e in effects if not plainly_special(problem, current.model, e)]
+    if len(itself) < len(effects) and not workers.late:
+        current = plainer(problem, current, every, {e.hypothesis.key for e in itself})
         rounds = renamed(rounds, effects, current.model.effects)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
@@ -290,7 +294,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
 
     def entered(effect: Effect) -> Fit | None:
         model = replace(current.model, effects=(*others, effect))
-        return refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
+        last = refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
+        return last and either_turn(problem, last, last.model.effects[-1], POLISH_STEPS)
 
     entrants = [own, *rivals] if rivals else []
     fits = workers.map_in_time(entered, entrants, lambda e: f"again: {e.hypothesis.effect} at {e.hypothesis.place}")
@@ -398,11 +403,17 @@ def as_loops(problem: Problem, current: Fit, workers: Workers) -> Fit:
 def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
     """The model with laws under which the arm may have several steady motions begun from other sizes, where they leave more than noise.
 
-    Between two sizes at which a record changes from one motion to another the cost has a minimum each.
+    Between two sizes at which a record changes from one motion to another the cost has a minimum each. So has a friction that
+    turns at once, and that turns within a velocity that is seen.
     """
     for effect in current.model.effects:
         h, resized, j = effect.hypothesis, effect.hypothesis.options.get("bends"), effect.hypothesis.joint
-        if resized is None or is_along_record(h) or current.costs[j] <= DETECTION_EXCESS * current.counts[j]:
+        if current.costs[j] <= DETECTION_EXCESS * current.counts[j]:
+            continue
+        turned = either_turn(problem, current, effect)
+        if turned.cost < current.cost - MIN_EVIDENCE:
+            current = polish(problem, turned)
+        if resized is None or is_along_record(h):
             continue
         others = tuple(e for e in current.model.effects if e.hypothesis.key != h.key)
         sizes = [clip_to_bounds(h, resized(effect.p, f, current.model.par.stiffness[j])) for f in LOOP_SIZES[1:]]
@@ -505,7 +516,7 @@ def renamed(rounds: Sequence[Round], before: Sequence[Effect], after: Sequence[E
     def of(found: Round) -> Round:
         first, *others = found.candidates
         h = new.get(first.hypothesis.key, first.hypothesis)
-        return replace(found, candidates=(replace(first, hypothesis=h), *others))
+        return replace(found, candidates=(replace(first, hypothesis=h), *(c for c in others if c.hypothesis.key != h.key)))
 
     return [of(r) for r in rounds]
 
@@ -517,6 +528,7 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
         kept: keys of effects that stay as they are.
     """
     known = {h.key: h for h in hypotheses}
+    special_by_itself = partial(plainly_special, problem, result.model)
     std = dict(zip(result.names, np.sqrt(np.maximum(np.diag(result.covariance()), 0.0)), strict=True))
 
     def plain(effect: Effect) -> Effect:
@@ -525,7 +537,7 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
         if h.key in kept or special is None or "apart" not in h.options:
             return effect
         hidden = h.options.get("give", lambda p: np.inf)(effect.p) < problem.q_std[h.joint]
-        if std[h.coordinate(h.options['apart'])] < UNTOLD and not hidden and not plainly_special(effect):
+        if std[h.coordinate(h.options['apart'])] < UNTOLD and not hidden and not special_by_itself(effect):
             return effect
         return Effect(special, clip_to_bounds(special, h.options["special"](effect.p)))
 
@@ -537,13 +549,28 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
     same = reweighted(problem, result, other.weights)
     scale = max(1.0, same.cost / same.count)
     # One that has reached what makes it its special case is that one, whatever errors of the law make of the rest.
-    certain = all(a is b or plainly_special(a) for a, b in zip(result.model.effects, effects, strict=True))
+    certain = all(a is b or special_by_itself(a) for a, b in zip(result.model.effects, effects, strict=True))
     return other if certain or other.cost - same.cost < swapped * MIN_EVIDENCE * scale else result
 
 
-def plainly_special(effect: Effect) -> bool:
-    """Whether the parameters of an effect say that it is its special case."""
-    return bool(effect.hypothesis.options.get("plain", lambda p: False)(effect.p))
+def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
+    """Whether an effect is its special case by its parameters, or beside laws along the record.
+
+    Along the record nothing says what friction takes of the torque while a motor rests: what a friction has within velocities at
+    which it may as well rest is an error of that.
+    """
+    h = effect.hypothesis
+    if h.options.get("plain", lambda p: False)(effect.p):
+        return True
+    if "within" not in h.options:
+        return False
+    v = h.options["within"](effect.p)
+
+    def unseen(group: Group) -> bool:
+        rests = group.rest is not None and bool(np.any(group.rest[..., h.joint]))
+        return rests and h.joint in joints_along_record(model, group) and v < NEXT_TO_REST * group.least_velocity[:, h.joint].mean()
+
+    return all(map(unseen, problem.groups))
 
 
 def attribute_once(

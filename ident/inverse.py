@@ -226,10 +226,6 @@ class Motion:
         left = signal_share(left, self._asked_noise(joint)) * left
         return self.group.to_time(left[..., None])[..., 0]
 
-    def turn_noise(self, joint: int) -> float:
-        """Standard deviation of the velocity that laws see, rad/s."""
-        return float(np.sqrt(np.mean(self.group.velocity_error[:, joint] ** 2)))
-
     def asked_noise(self, joint: int) -> float:
         """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean over records."""
         return float(np.sqrt(2.0 * np.sum(self._asked_noise(joint))))

@@ -160,6 +160,16 @@ class Group:
         return np.sqrt(2.0 * np.sum(self.omega[:, None] ** 2 * self.shown_error, axis=1))
 
     @cached_property
+    def turn_noise(self) -> np.ndarray:
+        """(n,) the same in the mean over records."""
+        return np.sqrt(np.mean(self.velocity_error**2, axis=0))
+
+    @cached_property
+    def least_velocity(self) -> np.ndarray:
+        """(S, n) below which a motor may as well rest: what its velocity is off by, or little, rad/s."""
+        return np.maximum(SURE * self.velocity_error, CREEPING * np.sqrt(np.mean(self.slow_velocity**2, axis=1)))
+
+    @cached_property
     def fast_velocity(self) -> np.ndarray | None:
         """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps; None of a motion."""
         if self.Q_fast is None:
@@ -485,13 +495,11 @@ def _lasting(rest: np.ndarray, width: int) -> np.ndarray:
 
 
 def _slow(group: Group) -> np.ndarray:
-    """(S, n_time, n) where the velocity that laws see of a motion is no more than what it is off by, or little.
+    """(S, n_time, n) where the velocity that laws see of a motion is as that of a motor that rests.
 
     Positions may differ by no more than noise where a motor moves slowly, and its direction is known.
     """
-    v = group.slow_velocity
-    usual = np.sqrt(np.mean(v**2, axis=1, keepdims=True))
-    return np.abs(v) < np.maximum(SURE * group.velocity_error[:, None], CREEPING * usual)
+    return np.abs(group.slow_velocity) < group.least_velocity[:, None]
 
 
 def _turning(group: Group) -> np.ndarray:

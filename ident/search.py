@@ -14,8 +14,9 @@ import numpy as np
 
 from ident.baseline import DETECTION_EXCESS, HOPELESS, astray, begun_again, implausible
 from ident.evidence import explained, last_is_pointless
-from ident.extended import Effect, Model, Prediction, along_record, as_loop, has_rough_law, is_along_record
+from ident.extended import Effect, Model, Prediction, along_record, as_loop, has_rough_law, is_along_record, is_dry
 from ident.hypotheses import Hypothesis
+from ident.hypotheses.friction import SMOOTHING, other_turn
 from ident.parallel import Workers
 from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import (
@@ -42,12 +43,13 @@ FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
 RECOVERIES = 2  # at most, of gears gone astray beside one
+RENEWALS = 3  # at most, of the noise of a law along the record under which its size is found
 STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit ends: the winner is fitted to the end
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
 HOPEFUL = 5  # candidates fitted further after the first steps
-AS_GOOD = 0.8  # cost of a loop over that along the record, below which it is the loop that is right
 RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the record leaves no more than noise
+OTHER_MOTION = 10.0  # chi2 of a loop over that along the record, each in its own noise, from which it is in another motion
 CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates refitted in a round
@@ -248,7 +250,8 @@ def explore(
         return result
 
     def finished(result: Fit) -> Fit:
-        return result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
+        last = result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
+        return either_turn(problem, last, last.model.effects[-1])
 
     def begun(chosen: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
         fits = workers.map_in_time(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
@@ -351,6 +354,22 @@ def refit(
     return result if np.any(felt > 0.0) else None
 
 
+def either_turn(problem: Problem, result: Fit, effect: Effect, iterations: int = 10) -> Fit:
+    """A fit with one of its effects, a dry friction that turns at once, as one that turns within a velocity that is seen, or the other
+    way round, where that costs less; no step of a fit leads from one to the other. As it is where the effect is another one."""
+    h = effect.hypothesis
+    if not is_dry(effect):
+        return result
+    at = [q.name for q in h.parameters].index(SMOOTHING.name)
+    turn = other_turn(problem.groups, h.joint, effect.p[at])
+    if turn is None:
+        return result
+    p = np.where(np.arange(len(effect.p)) == at, turn, effect.p)
+    effects = tuple(Effect(h, clip_to_bounds(h, p)) if e.hypothesis.key == h.key else e for e in result.model.effects)
+    other = refit(problem, replace(result.model, effects=effects), result.weights, result.remainders, iterations)
+    return other if other is not None and other.cost < result.cost else result
+
+
 def choose(scores: Sequence[Score]) -> list[Score]:
     """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
 
@@ -431,7 +450,8 @@ def beside_strong(
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                return recovered(problem, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP))
+                last = recovered(problem, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP))
+                return either_turn(problem, last, last.model.effects[-1])
         except NOT_COMPUTED:
             return None
 
@@ -448,8 +468,10 @@ def beside_strong(
             break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1], [x[0].joint])), key=lambda x: x[1].cost)
-    told = workers.map(lambda x: simulated(problem, *x), along[:FINALISTS])
-    right = [r for (_, r), (h, _) in zip(along[:FINALISTS], told, strict=True) if not is_along_record(h)]
+    again = workers.map(lambda x: under_its_noise(problem, x[1]), along[:FINALISTS])
+    along = [(h, r) for (h, _), r in zip(along[:FINALISTS], again, strict=True)]
+    told = workers.map(lambda x: simulated(problem, *x), along)
+    right = [r for (_, r), (h, _) in zip(along, told, strict=True) if not is_along_record(h)]
     strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(problem, h.joint, r, right))]
     if any(is_along_record(h) for h, _ in strong):
         own = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
@@ -462,6 +484,26 @@ def beside_strong(
         best.setdefault(h.key, (h, r))
     others = [(h, r) for h, r in ranked if h.key not in best]
     return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+
+
+def under_its_noise(problem: Problem, result: Fit) -> Fit:
+    """A fit along the record, of a law at joints where much is left, under the noise that it sees where it ends, once and again.
+
+    That noise is of the size of the law, and the size is found under it.
+    """
+    j = result.model.effects[-1].hypothesis.joint
+    for _ in range(RENEWALS):
+        if result.costs[j] <= RECORD_EXCESS * result.counts[j]:
+            return result
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+                other = fit(problem, revived(problem, result.model), iterations=STRONG_STEPS, remainders=result.remainders)
+        except NOT_COMPUTED:
+            return result
+        if not other.costs[j] < result.costs[j]:
+            return result
+        result = other
+    return result
 
 
 def recovered(problem: Problem, result: Fit) -> Fit:
@@ -520,7 +562,8 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
     """Whether a model that is predicted whole leaves noise at a joint, or about what one along the record leaves.
 
     Noise along the record is taken large for all joints, which flatters the model that it is taken for, most of all where
-    another cause is missing. Both are seen in that noise, each less what its own noise is in those units.
+    another cause is missing. Both are seen in that noise, each less what its own noise is in those units; not where the whole one is
+    far off in its own: much is within noise that is large enough.
 
     Args:
         whole: fits of models that are predicted whole, each under the noise that it sees itself.
@@ -530,6 +573,8 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
     best = min(whole, key=lambda r: r.costs[joint])
     if best.costs[joint] <= DETECTION_EXCESS * best.counts[joint]:
         return True
+    if best.costs[joint] > OTHER_MOTION * max(along.costs[joint], along.counts[joint]):
+        return False
     left = max(along.costs[joint] - along.counts[joint], 0.0)
     return bool(left >= CLEARLY_BETTER * excess_under(problem, joint, best, along.weights))
 
@@ -544,13 +589,14 @@ def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]
     """Whether a model along the record leaves no less at a joint than one along it whose law is right as a loop too.
 
     What the record tells both of them is no merit of a law that is right along it alone. Both are seen in the noise of the
-    former, each less what its own noise is in those units, as in ``matched``.
+    former, each less what its own noise is in those units, as in ``matched``. One that leaves clearly more in its own noise
+    is not right: a hardening gear that rattles makes so much of the noise that anything is within it.
 
     Args:
         right: fits along the record of models with such laws.
     """
     left = max(along.costs[joint] - along.counts[joint], 0.0)
-    others = [r for r in right if r.model.effects[-1].hypothesis.joint == joint]
+    others = [r for r in right if r.model.effects[-1].hypothesis.joint == joint and r.costs[joint] <= along.costs[joint] / CLEARLY_BETTER]
     return any(excess_under(problem, joint, r, along.weights) <= left for r in others)
 
 
@@ -565,9 +611,10 @@ def under_own_noise(problem: Problem, result: Fit) -> Fit | None:
 
 
 def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:
-    """A law of the gear that was fitted along the record, as the loop that it is where that reaches the noise, or nearly.
+    """A law of the gear that was fitted along the record, as the loop that it is where that leaves noise, or no more than along the record.
 
-    It does not where the arm rattles, and has several steady motions.
+    It does not where the arm rattles, and has several steady motions: then the loop is far off in its own noise, however large that
+    along the record. Both are seen in the latter, each less what its own noise is in those units, as in ``matched``.
     """
     loop = as_loop(h)
     *others, last = result.model.effects
@@ -575,9 +622,11 @@ def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis,
     other = refit(problem, model, result.weights, result.remainders, FIRST_STEPS)
     # At the joint itself: another cause may be elsewhere.
     j = h.joint
-    if other is not None and other.costs[j] < max(DETECTION_EXCESS * result.counts[j], AS_GOOD * result.costs[j]):
-        return loop, other
-    return h, result
+    own = None if other is None else under_own_noise(problem, other)
+    if own is None or own.costs[j] > OTHER_MOTION * max(result.costs[j], result.counts[j]):
+        return h, result
+    left = max(result.costs[j] - result.counts[j], (DETECTION_EXCESS - 1.0) * result.counts[j])
+    return (h, result) if excess_under(problem, j, own, result.weights) > left else (loop, other)
 
 
 def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:

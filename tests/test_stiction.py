@@ -14,9 +14,10 @@ from numba import njit
 from ident.attribute import plainly_special
 from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose, set_up
-from ident.extended import Effect, Model, predict
+from ident.extended import Effect, Model, along_record, predict
 from ident.hypotheses import catalogue
 from ident.records import Group, build_groups, without_creep
+from ident.search import either_turn, refit
 from ident.stiction import LEFT_HELD, as_held, held, held_share
 from ident.torque_fit import (
     data_counts,
@@ -249,7 +250,39 @@ def test_rest_tells_nothing_of_a_friction_within_the_noise_of_what_is_asked():
 
 
 def test_a_law_that_has_lost_what_sets_it_apart_is_its_special_case():
-    laws = {h.effect: h for h in catalogue(set_up(sticking()[0]).problem.structure)}
-    dips = [plainly_special(Effect(laws["stribeck_friction"], np.array([2.0, static, 0.01, 1e-3]))) for static in (1.7, 2.2, 2.4)]
-    assert dips == [True, True, False]
-    assert not plainly_special(Effect(laws["coulomb_friction"], np.array([2.0, 0.0, 1e-3])))
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    laws = {h.effect: h for h in catalogue(problem.structure)}
+
+    def special(effect, p):
+        return plainly_special(problem, model, Effect(laws[effect], np.array(p)))
+
+    assert [special("stribeck_friction", [2.0, static, 0.01, 1e-3]) for static in (1.7, 2.2, 2.4)] == [True, True, False]
+    assert not special("coulomb_friction", [2.0, 0.0, 1e-3])
+
+
+def test_a_dip_within_rest_is_none_beside_a_law_along_the_record():
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    laws = {h.effect: h for h in catalogue(problem.structure)}
+    slow = min(g.least_velocity[:, 0].mean() for g in problem.groups)
+    along = replace(model, effects=(Effect(along_record(laws["backlash"]), np.array([1e-3, 0.0])),))
+    for width, beside in ((0.5, True), (10.0, False)):
+        dip = Effect(laws["stribeck_friction"], np.array([COULOMB, STATIC, width * slow, 1e-4]))
+        assert plainly_special(problem, along, dip) is beside
+        assert not plainly_special(problem, model, dip)
+
+
+@pytest.mark.parametrize("begun", [1e-6, 0.1])
+def test_a_friction_that_sticks_is_found_from_either_side_of_what_is_seen(begun):
+    """Fits begun where it turns at once, and within a velocity that is seen: no step leads from the latter to the former."""
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, begun])
+    preds = [predict(model, g, problem.sampling) for g in problem.groups]
+    weights = make_weights(problem, preds, 0.0)
+    first = refit(problem, model, weights, [p.solution.W for p in preds])
+    last = either_turn(problem, first, first.model.effects[0])
+    seen = min(g.turn_noise[0] for g in problem.groups)
+    assert last.model.effects[0].value("smoothing_velocity") < 2.0 * seen
+    assert last.cost <= first.cost and (begun < seen or last.cost < 0.5 * first.cost)
+    assert last.model.effects[0].value("torque") == pytest.approx(COULOMB, rel=0.03)
+    # Without motors that rest, or for another effect, there is nothing to choose.
+    moving = replace(problem, groups=tuple(replace(g, rest=None) for g in problem.groups))
+    assert either_turn(moving, first, first.model.effects[0]) is first

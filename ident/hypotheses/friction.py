@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +11,13 @@ from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen,
 from ident.hypotheses.kernels import smooth_sign
 from ident.hypotheses.yielding import DAHL, bristle
 from ident.inverse import Motion
+from ident.records import Group
 
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
 REST_QUANTILE = 0.95  # of what a friction balances at rest, that says its size
 RESOLVED = 2.0  # velocity within which a friction turns over the noise of that which is seen, from which no rest is needed to know it
+AT_ONCE, SEEN_TO_TURN = 0.1, 2.0  # the same over that velocity, of frictions begun on either side of it
 SEEN = 3.0  # size of a friction over the noise of what is asked of it, below which rest tells nothing of it
 LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
@@ -88,8 +91,19 @@ def resting(motion: Motion, j: int, smoothing: float) -> np.ndarray | None:
     rest = motion.group.rest
     if rest is None or j in motion.told or not np.any(rest[..., j]):
         return None
-    seen = motion.group.window is None and smoothing > RESOLVED * motion.turn_noise(j)
+    seen = motion.group.window is None and smoothing > RESOLVED * motion.group.turn_noise[j]
     return None if seen else rest[..., j]
+
+
+def other_turn(groups: Sequence[Group], j: int, smoothing: float) -> float | None:
+    """Velocity within which a friction turns, rad/s, from which no step leads to ``smoothing``; None where no motor is seen to rest.
+
+    Rest tells a friction that turns at once, and not one that turns within a velocity that is seen.
+    """
+    known = [RESOLVED * g.turn_noise[j] for g in groups if g.window is None and g.rest is not None and np.any(g.rest[..., j])]
+    if not known:
+        return None
+    return AT_ONCE * min(known) if smoothing > min(known) else SEEN_TO_TURN * max(known)
 
 
 def held_at_start(motion: Motion, j: int, size: float) -> np.ndarray | None:
@@ -190,6 +204,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "dry": True,
             "trivial": lambda p, k: p[1] < LEAST_DIP * p[0],
             "plain": lambda p: p[1] < LEAST_DIP * p[0],
+            "within": lambda p: p[2],
             "widens": lambda p, s: [np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2]]) for f in (0.05, 0.3)],
         },
     )
