@@ -19,9 +19,11 @@ import numpy as np
 from bench_estimators import draw, frf_case
 
 from ident.candidates import draw_candidates
+from ident.chain import Structure, build_structure
 from ident.estimate import ESTIMATORS, fit_frf
-from ident.frf import FRF, estimate_frf
-from ident.graybox import Parameters, Structure, build_structure, equilibrium, linearise, parameter_names, sampled_frf
+from ident.frf import estimate_frf
+from ident.frf_basis import FRF
+from ident.graybox import Parameters, equilibrium, linearise, parameter_names, sampled_frf
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.effects.friction import CoulombFriction

@@ -14,11 +14,13 @@ import time
 
 import numpy as np
 
-from ident.diagnosis import identify
+from ident.chain import Structure, build_structure
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.excitation import LOOP_HZ, Excitation, make_plan, operating_points
-from ident.frf import FRF, Blocks, average, estimate_frf
-from ident.graybox import Parameters, Structure, build_structure, impedance, parameter_names, sampled_frf
+from ident.frf import Blocks, average, estimate_frf
+from ident.frf_basis import FRF
+from ident.graybox import Parameters, impedance, parameter_names, sampled_frf
+from ident.identification import identify
 from ident.information import LOOP_DAMPING, Conditions, conditions, linearised
 from robot_assets.robot import load_robot
 from sim import run_experiment

@@ -15,14 +15,15 @@ import numpy as np
 
 from ident.conclude import baseline_values, reported_parameters
 from ident.dataset import Dataset
-from ident.diagnosis import identify
 from ident.excitation import operating_points
 from ident.extended import Effect, Model, along_record
 from ident.gain import measure_gain, segment_errors
 from ident.hypotheses import Hypothesis, catalogue
+from ident.identification import identify
+from ident.problem import Problem
 from ident.show.export import NATIVE, build_mjcf, note_record
 from ident.show.simulated_gain import export_baseline, simulated_errors, spread
-from ident.torque_fit import Fit, Problem, fit
+from ident.torque_fit import Fit, fit
 from ident.verdict import Cause, Gain
 from robot_assets.robot import Robot, load_robot
 from sim import draw_effect, run_experiment

@@ -19,9 +19,10 @@ from dataclasses import replace
 import numpy as np
 
 from ident.candidates import draw_candidates
+from ident.chain import build_structure
 from ident.dataset import Dataset
 from ident.frf import estimate_frf
-from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
+from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
 from robot_assets.robot import Robot, load_robot
 from sim import run_experiment
 from sim.effects.drive import Cogging

@@ -15,10 +15,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.chain import Structure, build_structure
 from ident.design import design_experiment, design_plan
 from ident.estimate import fit_frf
-from ident.frf import FRF, estimate_frf
-from ident.graybox import Parameters, Structure, build_structure, equilibrium, linearise, sampled_frf
+from ident.frf import estimate_frf
+from ident.frf_basis import FRF
+from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
 from robot_assets.robot import load_robot
 from sim import run_experiment
 

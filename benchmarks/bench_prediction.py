@@ -36,12 +36,13 @@ from bench_estimators import draw, fitted_case, frf_case
 from provenance import commit
 from scipy.optimize import least_squares
 
+from ident.chain import Structure, build_structure
 from ident.dataset import Dataset
 from ident.estimate import fit_frf
 from ident.excitation import operating_points
 from ident.filters import extended_kalman, particle_filter
 from ident.frf import estimate_frf
-from ident.graybox import Parameters, Structure, build_structure, parameter_names
+from ident.graybox import Parameters, parameter_names
 from ident.kalman import local_predictor
 from ident.predict import Noise, PredictionFit, Predictor, Runs, fit_prediction, runs_of
 from robot_assets.errors import DataError

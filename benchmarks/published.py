@@ -17,10 +17,10 @@ import pinocchio as pin
 import scipy.fft
 import scipy.signal
 
+from ident.chain import build_structure
 from ident.dataset import Dataset
-from ident.diagnosis import set_up, with_held_out
-from ident.graybox import build_structure
-from ident.records import Group
+from ident.group import Group
+from ident.identification import set_up, with_held_out
 from ident.verdict import Diagnosis
 
 CUTOFF = 2.0  # of the low pass of the positions, in multiples of the compared band

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ident.dataset import Dataset, Segment
     from ident.dataset_io import load_dataset, save_dataset
-    from ident.diagnosis import diagnose, diagnose_fully, identify
+    from ident.diagnosis import diagnose, diagnose_fully
     from ident.frf import estimate_frf
+    from ident.identification import identify
     from ident.show.simulated_gain import simulated_gain
 
 _HOMES = {
@@ -18,7 +19,7 @@ _HOMES = {
     "save_dataset": "ident.dataset_io",
     "diagnose": "ident.diagnosis",
     "diagnose_fully": "ident.diagnosis",
-    "identify": "ident.diagnosis",
+    "identify": "ident.identification",
     "estimate_frf": "ident.frf",
     "simulated_gain": "ident.show.simulated_gain",
 }

@@ -10,7 +10,8 @@ import scipy.stats
 
 from ident.extended import Effect, Model
 from ident.graybox import Parameters
-from ident.torque_fit import ANNEALING, NOT_COMPUTED, Fit, Problem, anneal, fit
+from ident.problem import NOT_COMPUTED, Problem
+from ident.torque_fit import ANNEALING, Fit, anneal, fit
 
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom up to which the estimate of the noise may be short of it
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again

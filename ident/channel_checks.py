@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 import scipy.signal
 
+from ident.chain import build_structure
 from ident.dataset import Dataset, Segment
-from ident.graybox import build_structure
-from ident.records import difference_noise
+from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
 

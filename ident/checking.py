@@ -19,7 +19,7 @@ from ident.channel_checks import (
 from ident.dataset import CHANNELS, Dataset, Segment
 from ident.parallel import one_thread_each
 from ident.period_checks import period_warnings
-from ident.records import difference_noise
+from ident.rest import difference_noise
 from ident.skew_checks import skew_warnings
 from ident.torque_checks import torque_warnings
 from robot_assets.robot import linear_joints

@@ -8,18 +8,19 @@ import numpy as np
 
 from ident.attribute import DETECTION_LEVEL, Attribution
 from ident.baseline import DETECTION_EXCESS, UNDETERMINED
+from ident.chain import INERTIAL, Structure
 from ident.dataset import Dataset
 from ident.evidence import Candidate, pointless
 from ident.extended import Effect, Prediction, is_along_record
-from ident.graybox import INERTIAL, Structure
 from ident.hypotheses import Hypothesis
 from ident.link_sensor import LinkDelay
 from ident.next_experiment import NextExperiment, advice
 from ident.noise import drifting
+from ident.problem import Problem
 from ident.quantization import Steps
 from ident.reporting import describe, where
 from ident.rigid import RigidFit
-from ident.torque_fit import Fit, Problem
+from ident.torque_fit import Fit
 from ident.trust import (
     LEFT_ERROR,
     LEFT_NOISE,

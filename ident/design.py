@@ -23,8 +23,9 @@ import numpy as np
 import scipy.optimize
 
 from ident.candidates import Candidates, draw_candidates
+from ident.chain import Structure, build_structure
 from ident.excitation import Plan, make_plan
-from ident.graybox import Parameters, Structure, build_structure, parameter_names
+from ident.graybox import Parameters, parameter_names
 from ident.information import conditions, information, linearised, motor_loads
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.dataset import Dataset
-from ident.frf import FRF
+from ident.frf_basis import FRF
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from ident.frf import FRF
-from ident.graybox import Linearisation, Parameters, Structure, equilibrium, linearise, parameter_names, sampled_frf
+from ident.chain import Structure
+from ident.frf_basis import FRF
+from ident.graybox import Linearisation, Parameters, equilibrium, linearise, parameter_names, sampled_frf
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("nls", "wnls", "lls", "wlls")

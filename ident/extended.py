@@ -9,7 +9,9 @@ from functools import cached_property, partial
 import numpy as np
 import scipy.fft
 
-from ident.graybox import Parameters, Structure, damping_diagonal, impedance, stiffness_diagonal
+from ident.chain import Structure
+from ident.graybox import Parameters, damping_diagonal, impedance, stiffness_diagonal
+from ident.group import Group, signal_share
 from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import Hypothesis
 from ident.hypotheses.loop import modal_state, steady_loop
@@ -25,7 +27,7 @@ from ident.inverse import (
     solve,
     true_position,
 )
-from ident.records import POINTS_PER_LINE, Group, signal_share
+from ident.records import POINTS_PER_LINE
 
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
 LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of periodic data, at least

@@ -17,8 +17,9 @@ from ident.baseline import DETECTION_EXCESS
 from ident.extended import has_rough_law, is_along_record
 from ident.hypotheses import Hypothesis
 from ident.noise import drifting
+from ident.problem import Problem, predictions
 from ident.screening import Score, screen
-from ident.torque_fit import Fit, Problem, predictions
+from ident.torque_fit import Fit
 
 SEEN = 32.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
 ROUGH = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws, or one under which single

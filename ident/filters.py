@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from ident.graybox import Parameters, Structure, equilibrium, linearise
+from ident.chain import Structure
+from ident.graybox import Parameters, equilibrium, linearise
 from ident.kalman import Kalman, held, kalman, spring_torque, state_space
 from ident.predict import Noise, Prediction, Predictor, Runs, gaussian
 from ident.recursion import along_z, chain_of, recursion

@@ -15,45 +15,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import digamma
 
 from ident.dataset import Dataset, Segment
-from ident.records import mean_over_lines
+from ident.frf_basis import (
+    FRF,
+    SMOOTH,
+    choose_segments,
+    common_lines,
+    kron_by_line,
+    sample_noise_power,
+    steadied,
+    unvec,
+)
+from ident.group import mean_over_lines
+from ident.local_frf import estimate_local
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("auto", "h1", "jio", "ari", "har", "log")
 LOCAL = ("lpm", "lrm")  # of ``ident.local_frf``
-SMOOTH = 3  # lines on either side over which a covariance of few degrees of freedom is smoothed
-ENOUGH = 8  # degrees of freedom from which a variance is taken as it is
-
-
-@dataclass(frozen=True)
-class FRF:
-    """FRFs at Q operating points and F excited lines.
-
-    Attributes:
-        G: (Q, F, n, n) (rad/s2)/(N m).
-        covariance: (Q, F, n n, n n) of vec G, columns stacked; of the estimate, not of one period.
-        noise_std: (Q, F, n, n) standard deviation by measurement noise alone.
-        total_std: (Q, F, n, n) with stochastic nonlinear distortion where realizations show it.
-        frequency: (F,) Hz. lines: (F,).
-        operating_points: names. q0: (Q, n) rad, mean motor position.
-        amplitude: relative level. realizations, periods: averaged; the fewest of all points.
-        estimator: of ``ESTIMATORS`` or ``LOCAL``.
-    """
-
-    G: np.ndarray
-    covariance: np.ndarray
-    noise_std: np.ndarray
-    total_std: np.ndarray
-    frequency: np.ndarray
-    lines: np.ndarray
-    operating_points: tuple[str, ...]
-    q0: np.ndarray
-    amplitude: float
-    realizations: int
-    periods: int
-    estimator: str
 
 
 @dataclass(frozen=True)
@@ -63,11 +42,6 @@ class Blocks:
     U: np.ndarray
     Y: np.ndarray
     R: np.ndarray | None
-
-
-def frf_levels(dataset: Dataset, *, role: str = "identification") -> tuple[float, ...]:
-    """Excitation levels of the multisine segments of a role, highest first."""
-    return tuple(sorted({float(s.amplitude) for s in _periodic(dataset, role)}, reverse=True))
 
 
 def estimate_frf(
@@ -87,12 +61,10 @@ def estimate_frf(
     if estimator not in ESTIMATORS + LOCAL:
         raise DataError("estimator", "estimate_frf", repr(estimator), f"one of {ESTIMATORS + LOCAL}")
     if estimator in LOCAL:
-        from ident.local_frf import estimate_local
-
         return estimate_local(dataset, method=estimator, role=role, amplitude=amplitude)
     points, level = choose_segments(dataset, role, amplitude)
     chosen = [s for members in points.values() for s in members]
-    lines = _common_lines(chosen, dataset)
+    lines = common_lines(chosen, dataset)
     frequency = lines * dataset.sample_rate / chosen[0].period
     n = dataset.n
     blocks = [_blocks(members, lines, frequency, n, name) for name, members in points.items()]
@@ -101,9 +73,9 @@ def estimate_frf(
         raise DataError("r", f"operating point {without[0]}", "no reference of full rank", "r columns, which JIO needs")
     kind = estimator if estimator != "auto" else ("ari" if without else "jio")
     results = [average(b, kind) for b in blocks]
-    power = _sample_power(dataset, chosen[0].period, frequency)
+    power = sample_noise_power(dataset, chosen[0].period, frequency)
     spreads = [_covariance(b, G, kind, power) for b, G in zip(blocks, results, strict=True)]
-    diag = [tuple(_unvec(np.einsum("fii->fi", c).real, n) for c in pair) for pair in spreads]
+    diag = [tuple(unvec(np.einsum("fii->fi", c).real, n) for c in pair) for pair in spreads]
     return FRF(
         G=np.stack(results),
         covariance=np.stack([total for _, total in spreads]),
@@ -118,27 +90,6 @@ def estimate_frf(
         periods=min(b.U.shape[1] for b in blocks),
         estimator=kind,
     )
-
-
-def choose_segments(
-    dataset: Dataset, role: str, amplitude: float | None = None
-) -> tuple[dict[str, list[Segment]], float]:
-    """Multisine segments of a role at one level, by operating point, and that level; the highest where None.
-
-    Raises:
-        DataError: where there are none.
-    """
-    segments = _periodic(dataset, role)
-    if not segments:
-        raise DataError("multisine segments", dataset.name, f"none of role {role}", "at least n per operating point")
-    level = max(s.amplitude for s in segments) if amplitude is None else amplitude
-    points: dict[str, list[Segment]] = {}
-    for s in segments:
-        if np.isclose(s.amplitude, level):
-            points.setdefault(str(s.operating_point), []).append(s)
-    if not points:
-        raise DataError("amplitude", dataset.name, f"{level:g}", f"one of {frf_levels(dataset, role=role)}")
-    return points, float(level)
 
 
 def average(blocks: Blocks, estimator: str) -> np.ndarray:
@@ -156,31 +107,6 @@ def average(blocks: Blocks, estimator: str) -> np.ndarray:
     phase = mean / np.maximum(np.abs(mean), 1e-300)
     ratio = np.where(each == 0, 1e-300, each) / phase
     return np.exp(np.log(ratio).mean(axis=0)) * phase
-
-
-def _periodic(dataset: Dataset, role: str) -> list[Segment]:
-    return [s for s in dataset.select(role=role, kind="multisine") if len(s.excited_lines)]
-
-
-def _sample_power(dataset: Dataset, period: int, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Power (F, n) that white sample noise leaves in a line of torque and of acceleration."""
-    robot = dataset.robot
-    tau = np.asarray(robot.array("tau_std") if dataset.tau_std is None else dataset.tau_std, float)
-    q = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
-    one = np.ones((len(frequency), 1))
-    return one * tau**2 / period, (2 * np.pi * frequency[:, None]) ** 4 * q**2 / period
-
-
-def _common_lines(segments: list[Segment], dataset: Dataset) -> np.ndarray:
-    first = segments[0]
-    lines = np.asarray(first.excited_lines, int)
-    for s in segments:
-        if s.period != first.period:
-            raise DataError("period", s.name, str(s.period), f"{first.period} as in {first.name}")
-        lines = np.intersect1d(lines, s.excited_lines)
-    if not len(lines):
-        raise DataError("excited_lines", dataset.name, "no line that all segments share", "a common grid")
-    return lines
 
 
 def _blocks(members: list[Segment], lines: np.ndarray, frequency: np.ndarray, n: int, name: str) -> Blocks:
@@ -245,13 +171,13 @@ def _covariance(
     if P > 1:
         d = E - E.mean(axis=1, keepdims=True)
         dof = M * n * (P - 1)
-        noise = _smooth(np.einsum("mpfie,mpfke->fik", d, d.conj(), optimize=True) / (P * dof), dof, shape)
+        noise = steadied(np.einsum("mpfie,mpfke->fik", d, d.conj(), optimize=True) / (P * dof), dof, shape)
     elif M < 2:
         noise = expected
     total = noise
     if M > 1:
         e = E.mean(axis=1)
-        total = _smooth(np.einsum("mfie,mfke->fik", e, e.conj(), optimize=True) / ((M - 1) * n), (M - 1) * n, shape)
+        total = steadied(np.einsum("mfie,mfke->fik", e, e.conj(), optimize=True) / ((M - 1) * n), (M - 1) * n, shape)
         if noise is not None:
             # Distortion is smooth over frequency: its part is steadied before it is held at zero or more.
             k = np.arange(n)
@@ -263,7 +189,7 @@ def _covariance(
     if total is None:
         total = np.zeros((F, n, n), complex)
     noise = total if noise is None else noise
-    return _kron(K, noise), _kron(K, total)
+    return kron_by_line(K, noise), kron_by_line(K, total)
 
 
 def _gains(blocks: Blocks, estimator: str) -> np.ndarray:
@@ -273,36 +199,3 @@ def _gains(blocks: Blocks, estimator: str) -> np.ndarray:
         right = np.conj(np.swapaxes(U if estimator == "h1" else blocks.R, -1, -2))
         return right @ np.linalg.inv((U @ right).sum(axis=0))
     return np.linalg.inv(U) / len(U)
-
-
-def _kron(K: np.ndarray, Phi: np.ndarray) -> np.ndarray:
-    """Kronecker product line by line; (F, n n, n n)."""
-    F, n, _ = K.shape
-    return np.einsum("fjl,fik->fjilk", K, Phi).reshape(F, n * n, n * n)
-
-
-def _smooth(Phi: np.ndarray, dof: int, shape: np.ndarray) -> np.ndarray:
-    """(F, n, n) sample covariances of few degrees of freedom, steadied over neighbouring lines.
-
-    Variances: mean of the logarithms of their ratio to ``shape`` (F, n) over just enough lines,
-    freed of its bias ``digamma(dof) - ln dof``. Correlations: mean over ``SMOOTH`` lines on either side; where even
-    that is short of rank they are drawn towards zero.
-    """
-    n = Phi.shape[1]
-    k = np.arange(n)
-    variance = np.maximum(Phi[:, k, k].real, 1e-300)
-    root = np.sqrt(variance)
-    half = min(SMOOTH, int(np.ceil((ENOUGH / dof - 1) / 2)))
-    if half > 0:
-        variance = shape * np.exp(mean_over_lines(np.log(variance / shape), half) - digamma(dof) + np.log(dof))
-    correlation = Phi / (root[:, :, None] * root[:, None, :])
-    if dof < ENOUGH * n:
-        correlation = mean_over_lines(correlation, SMOOTH) * min(1.0, dof * (2 * SMOOTH + 1) / (ENOUGH * n))
-        correlation[:, k, k] = 1.0
-    scale = np.sqrt(variance)
-    return scale[:, :, None] * correlation * scale[:, None, :]
-
-
-def _unvec(x: np.ndarray, n: int) -> np.ndarray:
-    """(F, n n) of stacked columns to (F, n, n)."""
-    return np.swapaxes(x.reshape(-1, n, n), -1, -2)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.extended import Model, Prediction, predict
-from ident.records import Group
+from ident.group import Group
+from ident.output_noise import noise_covariance
+from ident.problem import Problem
 from ident.stiction import as_held, held_share
-from ident.torque_fit import Problem, noise_covariance
 from ident.verdict import Gain, JointGain
 
 METRIC = "RMS motor-torque prediction error, N m"

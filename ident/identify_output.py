@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from ident.chain import build_structure
 from ident.conclude import baseline_values
 from ident.dataset import Dataset
-from ident.diagnosis import identify
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.frf import estimate_frf
-from ident.graybox import Parameters, build_structure
+from ident.graybox import Parameters
+from ident.identification import identify
 from ident.outputs import outputs_into
 from ident.units import linear_names, parameter_unit
 from robot_assets.errors import DataError

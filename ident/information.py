@@ -23,8 +23,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ident.chain import Structure
 from ident.excitation import LOOP_HZ, TORQUE_SHARE, Excitation, shape_amplitudes
-from ident.graybox import Linearisation, Parameters, Structure, equilibrium, impedance, linearise, spring_deflections
+from ident.graybox import Linearisation, Parameters, equilibrium, impedance, linearise, spring_deflections
 from robot_assets.errors import DataError
 
 LOOP_DAMPING = 0.7  # of the position loop that holds a posture

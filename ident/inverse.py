@@ -21,19 +21,11 @@ from functools import cached_property
 import numpy as np
 import scipy.fft
 
+from ident.chain import Structure
 from ident.columns import Products
-from ident.graybox import (
-    Linearisation,
-    Parameters,
-    Structure,
-    alias_response,
-    equilibrium,
-    hold_response,
-    impedance,
-    linearise,
-)
+from ident.graybox import Linearisation, Parameters, alias_response, equilibrium, hold_response, impedance, linearise
+from ident.group import Group, signal_share
 from ident.mixing import mixed
-from ident.records import Group, signal_share
 from ident.recursion import chain_of, newton_euler
 
 REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder

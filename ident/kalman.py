@@ -19,15 +19,8 @@ import numpy as np
 import scipy.linalg
 from numba import njit
 
-from ident.graybox import (
-    Linearisation,
-    Parameters,
-    Structure,
-    damping_diagonal,
-    equilibrium,
-    linearise,
-    stiffness_diagonal,
-)
+from ident.chain import Structure
+from ident.graybox import Linearisation, Parameters, damping_diagonal, equilibrium, linearise, stiffness_diagonal
 from ident.predict import Noise, Prediction, Predictor, Runs, gaussian
 from robot_assets.errors import DataError
 

@@ -17,9 +17,9 @@ from ident.extended import (
     predict_at,
     simulated_laws,
 )
+from ident.group import NOISE_LINES, Group, mean_over_lines, signal_share
 from ident.hypotheses import kernels
 from ident.inverse import Solution
-from ident.records import NOISE_LINES, Group, mean_over_lines, signal_share
 
 NOISE_DRAWS = 4  # of the noise that laws of the gear answer to
 JUMP = 4.0  # power of what noise makes of a law, over that along the motion as it is, beyond which the arm jumps

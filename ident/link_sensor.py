@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident.derivatives import as_real
 from ident.extended import Prediction
+from ident.group import Group, mean_over_lines
 from ident.hypotheses.friction import direction
-from ident.records import Group, mean_over_lines
-from ident.torque_fit import Problem, as_real
+from ident.problem import Problem
 
 SURE = 5.0  # standard deviations from which a delay is one
 LEAST = 0.1  # delay in samples that is worth a name

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.frf import FRF, _common_lines, _kron, _sample_power, _smooth, _unvec, choose_segments
+from ident.frf_basis import FRF, choose_segments, common_lines, kron_by_line, sample_noise_power, steadied, unvec
 from robot_assets.errors import DataError
 
 METHODS = ("lpm", "lrm")
@@ -100,7 +100,7 @@ def estimate_local(
     for s in chosen:
         if s.r is None:
             raise DataError("r", s.name, "no reference", "r columns, which local methods need")
-    n, lines = dataset.n, _common_lines(chosen, dataset)
+    n, lines = dataset.n, common_lines(chosen, dataset)
     poles = poles if method == "lrm" else 0
     E = min(len(members) for members in points.values())
     P = min(int(s.periods or 0) for s in chosen)
@@ -116,10 +116,10 @@ def estimate_local(
         for name, spectra in ((name, _spectra(members, P, lines)) for name, members in points.items())
     ]
     frequency = lines[centres] * dataset.sample_rate / chosen[0].period
-    power = _sample_power(dataset, chosen[0].period * P, frequency)
+    power = sample_noise_power(dataset, chosen[0].period * P, frequency)
     noise, total = (np.stack([_covariance(row, power, kind) for row in results]) for kind in ("noise", "total"))
     k = np.arange(n * n)
-    std = [np.sqrt(np.stack([_unvec(c[:, k, k].real, n) for c in C])) for C in (noise, total)]
+    std = [np.sqrt(np.stack([unvec(c[:, k, k].real, n) for c in C])) for C in (noise, total)]
     return FRF(
         G=np.stack([[local.G for local in row] for row in results]),
         covariance=total,
@@ -236,4 +236,4 @@ def _covariance(row: list[Local], power: tuple[np.ndarray, np.ndarray], kind: st
     u, y = power
     expected = (np.abs(G) ** 2 @ u[:, :, None])[..., 0] + y
     dof = float(np.median([getattr(local, f"{kind}_dof") for local in row]))
-    return _kron(np.stack([local.gain for local in row]), _smooth(Phi, dof, np.maximum(expected, 1e-300)))
+    return kron_by_line(np.stack([local.gain for local in row]), steadied(Phi, dof, np.maximum(expected, 1e-300)))

@@ -15,15 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.attribute import Attribution
+from ident.derivatives import jacobian
 from ident.evidence import Candidate
 from ident.excitation import Plan, make_plan
 from ident.extended import predict, simulated_laws
 from ident.graybox import Parameters, equilibrium, linearise
+from ident.group import Group
 from ident.information import motor_loads
 from ident.parallel import map_threads
-from ident.records import Group
-from ident.torque_fit import Fit, Problem, jacobian, make_weights
+from ident.problem import Problem
+from ident.torque_fit import Fit
 from ident.verdict import Cause
+from ident.weights import make_weights
 from robot_assets.robot import linear_joints
 
 TIED = 0.1  # probability from which a second hypothesis is worth an experiment

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.optimize
 
-from ident.records import Group, mean_over_lines
+from ident.group import Group, mean_over_lines
 
 PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter

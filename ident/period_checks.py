@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.records import difference_noise
+from ident.rest import difference_noise
 
 SEEN = 5.0  # rms of a channel over the noise of its samples, from which it can tell
 REPEATS = 0.5  # of what a channel does within a period, by which periods may differ

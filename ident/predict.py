@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ident.chain import Structure
 from ident.dataset import Dataset
-from ident.frf import choose_segments
-from ident.graybox import Parameters, Structure, parameter_names
+from ident.frf_basis import choose_segments
+from ident.graybox import Parameters, parameter_names
 from robot_assets.errors import DataError
 
 PROMISE = 1e-3  # fall of -2 log L that a step promises at which a fit is done: far below one standard deviation

@@ -11,8 +11,10 @@ import scipy.fft
 from ident.dataset import Dataset, Segment
 from ident.extended import Effect, Model, Prediction, predict
 from ident.frf import estimate_frf
-from ident.records import Group
-from ident.torque_fit import Fit, Problem, noise_covariance, output_error, residual
+from ident.group import Group
+from ident.output_noise import noise_covariance
+from ident.problem import Problem, output_error, residual
+from ident.torque_fit import Fit
 from ident.units import text_at
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Where
 from robot_assets.errors import DataError

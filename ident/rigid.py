@@ -21,10 +21,11 @@ import numpy as np
 import pinocchio as pin
 import scipy.linalg
 
-from ident.graybox import Parameters, Structure, build_structure
+from ident.chain import Structure, build_structure
+from ident.graybox import Parameters
+from ident.group import Group
 from ident.hypotheses.friction import direction
 from ident.inverse import coarse_group
-from ident.records import Group
 from ident.recursion import Chain, chain_of, newton_euler
 
 COORDINATES = 10  # of the inertia of a body

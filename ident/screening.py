@@ -12,12 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ident.coordinates import prior_of
+from ident.derivatives import as_real, jacobian
 from ident.extended import Prediction
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.inverse import Motion
 from ident.parallel import map_threads
 from ident.posture import moved_by_gears
-from ident.torque_fit import RIDGE, Fit, Problem, as_real, jacobian, output_error, prior_of
+from ident.problem import Problem, output_error
+from ident.torque_fit import RIDGE, Fit
 from ident.torque_fit import inverse as steadied_inverse
 
 MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of the motor

@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 import scipy.signal
 
+from ident.chain import Structure, build_structure
 from ident.dataset import Dataset, Segment
-from ident.graybox import Structure, build_structure
-from ident.records import difference_noise
+from ident.rest import difference_noise
 
 LATEST = 0.03  # s: skews are looked for up to here
 ODD = 1.0  # samples: skews of less are common, and are said only where

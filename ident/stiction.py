@@ -12,7 +12,7 @@ import numpy as np
 import scipy.fft
 
 from ident.extended import Prediction, beside, is_dry
-from ident.records import Group
+from ident.group import Group
 
 PROBE = 1e-6  # of the torque, by which a drive asks for less to see what is held
 LEFT_HELD = 0.3  # of the noise of a motor that is held, that counts: when it is held is not known to the sample

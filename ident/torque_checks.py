@@ -14,9 +14,9 @@ import numpy as np
 import pinocchio as pin
 import scipy.signal
 
+from ident.chain import build_structure
 from ident.channel_checks import anti_resonance
 from ident.dataset import Dataset, Segment
-from ident.graybox import build_structure
 
 SEGMENTS = 6  # of a dataset, that a diagnosis looks at
 BAND = 12.0  # Hz, at most: below, links follow their motors

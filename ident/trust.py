@@ -7,24 +7,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.attribute import MIN_EVIDENCE, RIPPLE, SAME_PERIOD, UNTOLD, Attribution, Round
+from ident.attribute import Attribution
 from ident.baseline import DETECTION_EXCESS, implausible
+from ident.contests import RIPPLE, SAME_PERIOD
+from ident.costs import fair_costs, weighted_cost
 from ident.extended import Effect, Prediction
 from ident.faint import SHADOW
+from ident.group import Group
 from ident.hypotheses import Hypothesis
-from ident.records import Group
-from ident.search import settled
-from ident.torque_fit import (
-    NOT_COMPUTED,
-    Fit,
-    Problem,
-    data_counts,
-    fair_costs,
-    make_weights,
-    predictions,
-    weighted_cost,
-)
+from ident.problem import NOT_COMPUTED, Problem, data_counts, predictions
+from ident.pruning import UNTOLD
+from ident.refits import settled
+from ident.rounds import MIN_EVIDENCE, Round
+from ident.torque_fit import Fit
 from ident.verdict import Gain
+from ident.weights import make_weights
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
 WORSE = 1.05  # held-out error of the extended model, over that of the baseline, that refutes it

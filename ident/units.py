@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 
-from ident.graybox import INERTIAL
+from ident.chain import INERTIAL
 from robot_assets.robot import Robot, linear_joints
 
 LINEAR_UNITS = {

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnosis import identify
 from ident.excitation import operating_points
+from ident.identification import identify
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import draw_drives, plan_experiment

@@ -8,13 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.attribute import as_loops, from_other_motions
-from ident.diagnosis import set_up
+from ident.coordinates import pack, unpack
+from ident.costs import joint_costs
+from ident.derivatives import jacobian
 from ident.extended import Effect, Model, along_record, has_rough_law, is_along_record, joints_along_record, predict
 from ident.hypotheses import catalogue, kernels
 from ident.hypotheses.yielding import elastoplastic
+from ident.identification import set_up
 from ident.parallel import Workers
-from ident.search import simulated
-from ident.torque_fit import fit, jacobian, joint_costs, make_weights, pack, predictions, unpack
+from ident.problem import predictions
+from ident.strong import simulated
+from ident.torque_fit import fit
+from ident.weights import make_weights
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from tests.conftest import small_plan, through_files

@@ -9,8 +9,9 @@ import pinocchio as pin
 import pytest
 import scipy.linalg
 
+from ident.chain import build_structure
 from ident.excitation import operating_points
-from ident.graybox import Parameters, build_structure, equilibrium, linearise, stiffness_diagonal
+from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from robot_assets.robot import Elasticity, load_robot
 from sim import run_experiment
 from sim.plant import build_plant, rest

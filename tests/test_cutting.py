@@ -11,12 +11,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from ident.chain import build_structure
 from ident.cutting import SETTLE, cut_recording, schedule_plan, usage
 from ident.dataset_io import load_dataset
 from ident.estimate import fit_frf
 from ident.excitation import SPEED_SHARE, make_plan, point_to_point
 from ident.frf import estimate_frf
-from ident.graybox import Parameters, build_structure
+from ident.graybox import Parameters
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import run_experiment

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ident.candidates import build_body, configuration, draw_candidates, flange_height
+from ident.chain import build_structure
 from ident.cli import main
 from ident.design import (
     apportion,
@@ -17,7 +18,7 @@ from ident.design import (
     round_weights,
 )
 from ident.excitation import LOOP_HZ, Excitation, operating_points, plan_from_toml, plan_to_toml
-from ident.graybox import Parameters, build_structure, impedance, sampled_frf
+from ident.graybox import Parameters, impedance, sampled_frf
 from ident.information import LOOP_DAMPING, conditions, information, linearised
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot

@@ -5,25 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnosis import set_up
+from ident.coordinates import coordinate_names, pack, unpack
+from ident.costs import by_noise, fair_costs, joint_costs
+from ident.derivatives import shared_information, shared_slope
 from ident.errors_in_variables import MOST, information_left, trusted_share
 from ident.extended import Effect, Model, predict
 from ident.hypotheses import catalogue
+from ident.identification import set_up
 from ident.inverse import REMAINDER_STEPS
-from ident.search import refit
-from ident.torque_fit import (
-    by_noise,
-    coordinate_names,
-    fair_costs,
-    fit,
-    joint_costs,
-    make_weights,
-    pack,
-    predictions,
-    shared_information,
-    shared_slope,
-    unpack,
-)
+from ident.problem import predictions
+from ident.refits import refit
+from ident.torque_fit import fit
+from ident.weights import make_weights
 from sim import run_experiment
 from sim.experiment import draw_drives
 from tests.conftest import small_plan
@@ -73,7 +66,8 @@ def test_noise_of_the_position_moves_no_parameter(noisy, monkeypatch):
         return error / np.sqrt(np.diag(found.covariance()))[: len(error)]
 
     assert np.sqrt(np.mean(off() ** 2)) < 1.3 and np.abs(off()).max() < 4.0
-    monkeypatch.setattr("ident.torque_fit.has_scatter", lambda *args: False)
+    for module in ("torque_fit", "weights", "costs"):
+        monkeypatch.setattr(f"ident.{module}.has_scatter", lambda *args: False)
     assert np.sqrt(np.mean(off() ** 2)) > 2.0 and np.abs(off()).max() > 5.0
 
 

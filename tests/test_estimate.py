@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ident.chain import build_structure
 from ident.estimate import ESTIMATORS, UNSEEN, _sandwich, fit_frf
 from ident.excitation import operating_points
-from ident.frf import FRF
-from ident.graybox import Parameters, build_structure, equilibrium, linearise, parameter_names, sampled_frf
+from ident.frf_basis import FRF
+from ident.graybox import Parameters, equilibrium, linearise, parameter_names, sampled_frf
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 

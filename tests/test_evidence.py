@@ -8,37 +8,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.attribute import (
-    LAWS_LEAVE,
-    LEFT_TO_DECOYS,
-    Attribution,
-    Round,
-    attribute,
-    companions,
-    leaves_much,
-    left_share,
-    less_errors_of_laws,
-    outdone,
-    pruned,
-    settled,
-    settles_its_joint,
-    shadows,
-    with_name,
-    without_shadows,
-)
+from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, companions, less_errors_of_laws
 from ident.baseline import astray
 from ident.conclude import _cause, conclude, faint_note
-from ident.diagnosis import diagnose, harmful, identify
+from ident.coordinates import PRIOR_LOG_STD, pack, unpack
+from ident.costs import joint_costs, noise_costs, weighted_cost
+from ident.derivatives import jacobian
+from ident.diagnosis import diagnose, harmful
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
 from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import hinge_inertia
+from ident.identification import identify
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, stalled
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
+from ident.problem import Weights, data_counts, predictions
+from ident.pruning import pruned, without_shadows
+from ident.refits import polish, refit, reweighted, settled, turned, under_own_noise
 from ident.reporting import frf_views
+from ident.rounds import Round, leaves_much, left_share, outdone, settles_its_joint, shadows, with_name
 from ident.screening import (
     Score,
     _Field,
@@ -50,41 +41,12 @@ from ident.screening import (
     _whole_sums,
     screen,
 )
-from ident.search import (
-    PER_EFFECT,
-    STRONG,
-    begin,
-    beside_strong,
-    choose,
-    explore,
-    matched,
-    other_bodies,
-    outdone_along,
-    polish,
-    refit,
-    reweighted,
-    strong_effects,
-    turned,
-    under_own_noise,
-)
-from ident.torque_fit import (
-    PRIOR_LOG_STD,
-    RIDGE,
-    Weights,
-    data_counts,
-    fit,
-    inverse,
-    jacobian,
-    joint_costs,
-    make_weights,
-    noise_costs,
-    pack,
-    predictions,
-    unpack,
-    weighted_cost,
-)
+from ident.search import PER_EFFECT, STRONG, begin, choose, explore, other_bodies
+from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
+from ident.torque_fit import RIDGE, fit, inverse
 from ident.trust import shadowed, shown
 from ident.verdict import UNKNOWN, Gain
+from ident.weights import make_weights
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
@@ -488,7 +450,7 @@ def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
 
 
 def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
-    from ident.diagnosis import LEAST_NOISE, _noise
+    from ident.identification import LEAST_NOISE, _noise
 
     data = clean[0]
     t = np.arange(len(data.segments[0].t))[:, None] / data.sample_rate
@@ -601,9 +563,11 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     assert wrong.costs[joint] > 2.0 * wrong.counts[joint] > flattered.costs[joint]
     assert matched(problem, joint, flattered, [wrong, result])
     assert not matched(problem, joint, flattered, [wrong]) and not matched(problem, joint, flattered, [])
-    # The same error in noise so large that it hides it is not less of an error.
-    hidden = replace(wrong, weights=loud, costs=wrong.counts + 0.01 * (wrong.costs - wrong.counts))
-    assert matched(problem, joint, hidden, [wrong])
+    # The same error in noise so large that it hides it is not less of an error, but for one that is far off without.
+    assert wrong.costs[joint] > 2.0 * OTHER_MOTION * wrong.counts[joint]
+    for share, same in ((0.2, True), (0.01, False)):
+        hidden = replace(wrong, weights=loud, costs=wrong.counts + share * (wrong.costs - wrong.counts))
+        assert matched(problem, joint, hidden, [wrong]) is same
 
 
 def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(identified, named):
@@ -618,6 +582,8 @@ def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(ide
     assert outdone_along(problem, j, along, [wrong, right])
     assert not outdone_along(problem, j, along, [wrong]) and not outdone_along(problem, j, along, [])
     assert not outdone_along(problem, j - 1, along, [right])
+    # One that leaves more in its own noise makes so much of that that anything is within it.
+    assert not outdone_along(problem, j, along, [replace(right, costs=1.5 * right.counts)])
 
 
 def test_no_strong_effect_is_sought_where_a_cause_has_left_next_to_nothing(identified, named):
@@ -697,7 +663,7 @@ def test_a_search_seeks_no_strong_effect_at_quiet_joints(identified, monkeypatch
     def lost(*args, **kwargs):
         raise ArithmeticError
 
-    monkeypatch.setattr("ident.search.anneal", lost)
+    monkeypatch.setattr("ident.strong.anneal", lost)
     scores = screen(problem, result, predictions(problem, result.model, result.remainders), catalogue(problem.structure))
     for quiet in (range(6), ()):
         assert beside_strong(problem, result, [], scores, Workers(progress=told.append), frozenset(quiet)) == (result, [])
@@ -948,11 +914,11 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
         return replace(baseline, model=start, costs=left * baseline.counts)
 
     scores = [Score(h, 1.0, 1, np.array([1e-4, 0.0]), np.ones(1), ()) for h in (other, backlash)]
-    monkeypatch.setattr("ident.search.strong_effects", lambda *args: scores)
-    monkeypatch.setattr("ident.search.anneal", annealed)
-    monkeypatch.setattr("ident.search.simulated", lambda problem, h, result: (h, result))
-    monkeypatch.setattr("ident.search.under_own_noise", lambda problem, result: None)
-    monkeypatch.setattr("ident.search.implausible", lambda *args: False)
+    monkeypatch.setattr("ident.strong.strong_effects", lambda *args: scores)
+    monkeypatch.setattr("ident.strong.anneal", annealed)
+    monkeypatch.setattr("ident.strong.simulated", lambda problem, h, result: (h, result))
+    monkeypatch.setattr("ident.strong.under_own_noise", lambda problem, result: None)
+    monkeypatch.setattr("ident.strong.implausible", lambda *args: False)
     loud = replace(baseline, costs=10.0 * baseline.counts)
     beside_strong(setup.problem, loud, [(backlash, replace(loud, costs=5.0 * baseline.counts))], [], Workers())
     assert tried == joints

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ident.attribute import LEFT_TO_DECOYS, Attribution, Round, attribute, temper_of, told_share, weighed_round
+from ident.attribute import LEFT_TO_DECOYS, Attribution, attribute
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.conclude import drift_note
 from ident.diagnosis import diagnose, explained
@@ -16,7 +16,9 @@ from ident.extended import Effect, along_record, as_loop
 from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
 from ident.hypotheses import catalogue
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
-from ident.search import hopeful, refit
+from ident.refits import refit
+from ident.rounds import Round, temper_of, told_share, weighed_round
+from ident.search import hopeful
 from ident.trust import denied
 from ident.verdict import UNKNOWN
 from sim import parse_effect, run_experiment
@@ -359,8 +361,9 @@ def test_earlier_causes_are_weighed_again_before_more_is_sought(identified, hypo
     monkeypatch.setattr("ident.attribute.plainer", lambda problem, current, *rest: current)
     monkeypatch.setattr("ident.attribute.companions", lambda problem, current, *rest: (current, []))
     monkeypatch.setattr("ident.attribute.without_shadows", lambda problem, current, *rest: current)
-    monkeypatch.setattr("ident.attribute.rematched", rematched)
-    monkeypatch.setattr("ident.attribute.pruned", pruned)
+    monkeypatch.setattr("ident.contests.rematched", rematched)
+    for module in ("attribute", "contests"):
+        monkeypatch.setattr(f"ident.{module}.pruned", pruned)
     attribute(setup.problem, loud)
     a, b, c = setup.problem.structure.robot.joint_names[:3]
     assert order == [1, 2, [a], 2, 3, [a, b], 3, [a, b, c], 3]

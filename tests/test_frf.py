@@ -7,7 +7,8 @@ import pytest
 
 from ident.dataset import Dataset, Segment
 from ident.distortion import estimate_distortion
-from ident.frf import Blocks, _covariance, average, estimate_frf, frf_levels
+from ident.frf import Blocks, _covariance, average, estimate_frf
+from ident.frf_basis import frf_levels
 from robot_assets.errors import DataError
 
 

@@ -7,7 +7,8 @@ import pinocchio as pin
 import pytest
 import scipy.linalg
 
-from ident.graybox import LinkChange, Parameters, build_structure, equilibrium, linearise, sampled_frf
+from ident.chain import LinkChange, build_structure
+from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
 from robot_assets.robot import Elasticity, load_robot
 

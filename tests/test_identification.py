@@ -6,15 +6,22 @@ import numpy as np
 import pytest
 
 from ident.baseline import discrepancy_p_value
-from ident.diagnosis import diagnose, set_up
+from ident.chain import build_structure
+from ident.coordinates import pack, unpack
+from ident.costs import joint_costs
+from ident.derivatives import jacobian
+from ident.diagnosis import diagnose
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.extended import Effect, Model, predict
 from ident.frf import estimate_frf
 from ident.gain import segment_errors
-from ident.graybox import Parameters, build_structure, equilibrium, linearise, sampled_frf
+from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
+from ident.identification import set_up
+from ident.problem import output_error, predictions
 from ident.screening import screen
-from ident.torque_fit import SLIGHT, fit, jacobian, joint_costs, make_weights, output_error, pack, predictions, unpack
+from ident.torque_fit import SLIGHT, fit
+from ident.weights import make_weights
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
@@ -201,7 +208,7 @@ def test_a_winner_beside_a_law_of_the_gear_is_fitted_by_exact_columns(panda_prob
 def test_columns_beside_a_loop_serve_as_long_as_they_foretell_the_cost(panda_problem, monkeypatch):
     """Fewer of them lead to where new ones in every step lead; what has no loop gets new ones in every step."""
     problem, calls = panda_problem, []
-    monkeypatch.setattr("ident.torque_fit.jacobian", lambda *a, **k: calls.append(1) or jacobian(*a, **k))
+    monkeypatch.setattr("ident.derivatives.jacobian", lambda *a, **k: calls.append(1) or jacobian(*a, **k))
 
     def fitted(key, value):
         (h,) = (h for h in catalogue(problem.structure) if h.key == key)

@@ -617,7 +617,7 @@ def test_the_robot_of_each_machine_explains_its_torque(tmp_path, folder, files, 
 
 @pytest.mark.parametrize("name", ["kr300", "tx40", "emps", "ur10_bare", "panda_bare"])
 def test_both_engines_build_the_robots_of_the_real_data(name):
-    from ident.graybox import build_structure
+    from ident.chain import build_structure
     from sim.plant import build_plant, link_inertia_diagonal
 
     robot = load_robot(name)

@@ -4,6 +4,7 @@ import ast
 import importlib
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,44 @@ def test_sim_knows_the_data_and_no_model_of_ident(path):
 @pytest.mark.parametrize("path", sorted(ROOT.glob("robot_assets/**/*.py")), ids=str)
 def test_assets_know_no_engine(path):
     assert not {m.split(".")[0] for m in imports(path)} & {"sim", "ident", "mujoco", "pinocchio"}
+
+
+def arrows() -> dict[str, set[str]]:
+    """Modules of ``ident`` by name, and the modules of it that each imports."""
+    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in ROOT.glob("ident/**/*.py")}
+    out = {}
+    for name, path in modules.items():
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {a.name for a in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                within = {f"{node.module}.{a.name}" for a in node.names} & set(modules)
+                found |= within or {node.module}
+        out[name] = (found & set(modules)) - {name}
+    return out
+
+
+def test_no_module_of_ident_hangs_on_itself():
+    order = list(TopologicalSorter(arrows()).static_order())
+    assert order.index("ident.graybox") < order.index("ident.torque_fit") < order.index("ident.attribute") < order.index("ident.cli")
+
+
+@pytest.mark.parametrize(
+    ("below", "above"),
+    [
+        ({"ident.graybox", "ident.inverse", "ident.extended"}, {"ident.problem", "ident.torque_fit", "ident.screening"}),
+        ({"ident.problem", "ident.weights", "ident.costs", "ident.derivatives", "ident.torque_fit"}, {"ident.screening", "ident.evidence"}),
+        ({"ident.screening", "ident.refits", "ident.search", "ident.strong", "ident.rounds"}, {"ident.attribute", "ident.trust", "ident.gain"}),
+        ({"ident.attribute", "ident.conclude", "ident.diagnosis"}, {"ident.show", "ident.convert", "ident.cli"}),
+        ({"ident.frf", "ident.estimate"}, {"ident.torque_fit", "ident.attribute"}),
+    ],
+)
+def test_lower_layers_know_nothing_of_higher_ones(below, above):
+    graph, known = arrows(), set(below)
+    while more := set().union(*(graph[m] for m in known)) - known:
+        known |= more
+    assert not {m for m in known for a in above if m == a or m.startswith(f"{a}.")}
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)

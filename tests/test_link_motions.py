@@ -5,11 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnosis import diagnose, diagnose_fully, set_up
+from ident.coordinates import pack, unpack
+from ident.derivatives import jacobian
+from ident.diagnosis import diagnose, diagnose_fully
 from ident.extended import Effect, Model
 from ident.hypotheses import catalogue
+from ident.identification import set_up
 from ident.link_sensor import LinkDelay, comparable_links, with_link_encoders
-from ident.torque_fit import data_count, data_counts, jacobian, make_weights, pack, predictions, unpack
+from ident.problem import data_count, data_counts, predictions
+from ident.weights import make_weights
 from sim import run_experiment
 from sim.effects import parse_effect
 from sim.experiment import draw_drives

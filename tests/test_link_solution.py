@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ident import inverse
-from ident.diagnosis import set_up
 from ident.extended import Model, predict
+from ident.identification import set_up
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, geometric_remainder, make_plane, solve, true_position
 from robot_assets.robot import load_robot
 from sim import run_experiment

@@ -12,8 +12,9 @@ import pytest
 from ident.convert import convert_logs
 from ident.convert.reading import list_signals
 from ident.dataset import Dataset, Segment
-from ident.diagnosis import diagnose, set_up
+from ident.diagnosis import diagnose
 from ident.gain import Errors, measure_gain
+from ident.identification import set_up
 from ident.torque_checks import mislabelled
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnosis import set_up
 from ident.extended import Effect, Model, along_record, predict
 from ident.hypotheses import catalogue
+from ident.identification import set_up
 from ident.law_noise import loop_noise
-from ident.torque_fit import make_weights, output_error
+from ident.problem import output_error
+from ident.weights import make_weights
 
 PERIODS = 4
 NOISE = 0.025  # of samples of the deflection, over the width of the middle of the law
@@ -52,7 +53,7 @@ def test_weights_know_what_a_law_makes_of_the_noise(noisy, monkeypatch):
     problem, model, groups = noisy
     left = np.mean([left_at(problem, model, g) for g in groups], axis=0)
     assert left == pytest.approx(np.ones(len(left)), abs=0.25)
-    monkeypatch.setattr("ident.torque_fit.loop_noise", lambda pred, group: None)
+    monkeypatch.setattr("ident.output_noise.loop_noise", lambda pred, group: None)
     assert np.mean([left_at(problem, model, g) for g in groups], axis=0)[0] > 1.3
 
 

@@ -17,7 +17,7 @@ from ident.torque_fit import fit
 @pytest.fixture(scope="module")
 def fitted(clean):
     """Problem, and the baseline, a hardening gear and Coulomb friction at the elbow, each as it stands."""
-    from ident.diagnosis import identify
+    from ident.identification import identify
 
     setup, baseline = identify(clean[0])
     named = {h.key: h for h in catalogue(setup.problem.structure)}

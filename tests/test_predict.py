@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ident.chain import build_structure
 from ident.cutting import cut_recording, schedule_plan
 from ident.estimate import fit_frf
 from ident.filters import extended_kalman, particle_filter, stepper
-from ident.frf import FRF
-from ident.graybox import Parameters, build_structure, equilibrium, impedance, linearise, parameter_names, sampled_frf
+from ident.frf_basis import FRF
+from ident.graybox import Parameters, equilibrium, impedance, linearise, parameter_names, sampled_frf
 from ident.kalman import StateSpace, innovations, kalman, local_predictor, state_space
 from ident.predict import Noise, Runs, fit_prediction, gaussian, runs_of, score
 from ident.recursion import along_z, chain_of

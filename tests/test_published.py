@@ -7,10 +7,11 @@ import pinocchio as pin
 import pytest
 
 from benchmarks.published import EMPS, Motion, drive_found, emps_relative_error, motions, plain, references
+from ident.chain import build_structure
 from ident.convert import convert_logs
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnosis import diagnose_fully, set_up
-from ident.graybox import build_structure
+from ident.diagnosis import diagnose_fully
+from ident.identification import set_up
 from robot_assets.robot import load_robot
 
 EMPS_DATA = Path(__file__).parent.parent.parent / "shared" / "data" / "emps_drive"

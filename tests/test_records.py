@@ -6,14 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ident.closing import close_motion
 from ident.dataset import Dataset, Segment
-from ident.diagnosis import diagnose, set_up
+from ident.diagnosis import diagnose
 from ident.extended import Effect, Model, predict
 from ident.gain import mean_squares, stretch_squares
 from ident.hypotheses import catalogue
+from ident.identification import set_up
 from ident.law_noise import law_noise
-from ident.records import build_groups, close_motion
-from ident.torque_fit import data_count, make_weights
+from ident.problem import data_count
+from ident.records import build_groups
+from ident.weights import make_weights
 from robot_assets.robot import load_robot
 
 RATE = 500.0

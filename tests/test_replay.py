@@ -6,9 +6,10 @@ import pytest
 from benchmarks.bench_export import both_gains
 from ident import simulated_gain
 from ident.dataset_io import load_dataset
-from ident.diagnosis import diagnose_fully, set_up
+from ident.diagnosis import diagnose_fully
 from ident.excitation import operating_points
 from ident.extended import Model, predict
+from ident.identification import set_up
 from ident.records import build_groups
 from ident.show.export import write_mjcf
 from ident.show.replay import equilibrium, load_arm, replay, sampled_impedance

@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from ident.chain import build_structure
 from ident.excitation import make_plan, plan_from_toml
-from ident.graybox import Parameters, build_structure, equilibrium, linearise, parameter_names
+from ident.graybox import Parameters, equilibrium, linearise, parameter_names
 from ident.hypotheses.structure import Change, apply_change
 from ident.show.export import build_mjcf
 from ident.show.figures import rounded, trace_figure

@@ -11,25 +11,22 @@ import numpy as np
 import pytest
 from numba import njit
 
-from ident.attribute import plainly_special
+from ident.coordinates import pack, unpack
+from ident.costs import fair_costs, joint_costs
 from ident.dataset import Dataset, Segment
-from ident.diagnosis import diagnose, set_up
+from ident.derivatives import jacobian
+from ident.diagnosis import diagnose
 from ident.extended import Effect, Model, along_record, predict
+from ident.group import Group
 from ident.hypotheses import catalogue
-from ident.records import Group, build_groups, without_creep
-from ident.search import either_turn, refit
+from ident.identification import set_up
+from ident.output_noise import noise_covariance
+from ident.problem import data_counts, residual
+from ident.pruning import plainly_special
+from ident.records import build_groups, without_creep
+from ident.refits import either_turn, refit
 from ident.stiction import LEFT_HELD, as_held, held, held_share
-from ident.torque_fit import (
-    data_counts,
-    fair_costs,
-    jacobian,
-    joint_costs,
-    make_weights,
-    noise_covariance,
-    pack,
-    residual,
-    unpack,
-)
+from ident.weights import make_weights
 from robot_assets.robot import load_robot
 
 FS, PERIOD, PERIODS, STEPS = 1000.0, 2000, 3, 16
@@ -203,7 +200,7 @@ def test_what_is_held_hangs_on_few_parameters(monkeypatch):
     x, off = pack(model), {}
     J = jacobian(problem, model, group, pred).dense()
     with monkeypatch.context() as without:
-        without.setattr("ident.torque_fit.held", lambda *_: None)
+        without.setattr("ident.derivatives.held", lambda *_: None)
         unaware = jacobian(problem, model, group, pred).dense()
     for c in (0, 2, 3, len(model.par.to_log()) + 1):
         ends = [predict(unpack(model, x + s * 1e-4 * (np.arange(len(x)) == c), np.inf), group, problem.sampling, W=pred.solution.W).U for s in (1, -1)]

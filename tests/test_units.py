@@ -2,9 +2,9 @@
 
 import pytest
 
+from ident.chain import build_structure
 from ident.conclude import at_linear_joint
 from ident.extended import Effect
-from ident.graybox import build_structure
 from ident.hypotheses import catalogue
 from ident.units import (
     KIND_UNITS,

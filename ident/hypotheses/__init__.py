@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.graybox import Structure
+from ident.chain import Structure
 from ident.hypotheses import drive, friction, sensing, structure, transmission
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.group import Group
 from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.kernels import smooth_sign
 from ident.hypotheses.yielding import DAHL, bristle
 from ident.inverse import Motion
-from ident.records import Group
 
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways

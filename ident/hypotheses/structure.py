@@ -11,14 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from ident.graybox import (
-    LinkChange,
-    Parameters,
-    Structure,
-    build_structure,
-    equilibrium,
-    linearise,
-)
+from ident.chain import LinkChange, Structure, build_structure
+from ident.graybox import Parameters, equilibrium, linearise
+from ident.group import Group
 from ident.hypotheses import kernels
 from ident.hypotheses.friction import SMOOTHING, direction
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
@@ -32,7 +27,6 @@ from ident.inverse import (
     plane_at,
     solve,
 )
-from ident.records import Group
 from robot_assets.robot import Elasticity
 
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import tomlkit
 
-from ident.graybox import LinkChange, build_structure
+from ident.chain import LinkChange, build_structure
 from ident.hypotheses.yielding import DAHL, SLIP
 from ident.show.slips import maxwell_slips
 from ident.units import unit_suffix

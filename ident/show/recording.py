@@ -9,7 +9,7 @@ import pinocchio as pin
 import rerun as rr
 import rerun.blueprint as rrb
 
-from ident.graybox import build_structure
+from ident.chain import build_structure
 from ident.show.figures import frf_picture, rounded
 from ident.units import response_unit, torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis, TorqueTrace

@@ -24,8 +24,8 @@ import scipy.fft
 from mujoco.batch import Batch
 
 from ident.graybox import hold_response
+from ident.group import Group
 from ident.inverse import Sampling
-from ident.records import Group
 from ident.show.export import FRICTION_SLIP, PASSIVE_GROUP, TORQUE_OFFSET, stage_lead
 
 LOOP = 0.15  # frequency of the loop times the time by which torque lags what the loop sees, rad

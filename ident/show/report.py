@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-from ident.graybox import INERTIAL
+from ident.chain import INERTIAL
 from ident.show.figures import (
     evidence_figure,
     frf_figure,

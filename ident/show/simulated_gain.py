@@ -9,16 +9,18 @@ import mujoco
 import numpy as np
 
 from ident.dataset import Dataset
-from ident.diagnosis import SEED, identify, with_held_out
+from ident.diagnosis import SEED
 from ident.extended import Model, predict
 from ident.gain import Errors, mean_squares, measure_gain
 from ident.graybox import parameter_names
+from ident.group import Group
+from ident.identification import identify, with_held_out
+from ident.output_noise import noise_covariance
 from ident.parallel import one_thread_each
-from ident.records import Group
+from ident.problem import Problem, predictions
 from ident.reporting import affected_joints
 from ident.show.export import build_mjcf, note_record
 from ident.show.replay import load_arm, replay
-from ident.torque_fit import Problem, noise_covariance, predictions
 from ident.verdict import Gain
 from robot_assets.errors import DataError
 

@@ -1,0 +1,134 @@
+"""Causes against their rivals once more, beside all that was found after them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from ident.evidence import Candidate, model_error, weigh
+from ident.extended import Effect
+from ident.hypotheses import Hypothesis, catalogue
+from ident.parallel import Workers
+from ident.problem import Problem, predictions
+from ident.pruning import pruned
+from ident.refits import (
+    FAINT,
+    FINALISTS,
+    FIRST_STEPS,
+    POLISH_STEPS,
+    clip_to_bounds,
+    either_turn,
+    polish,
+    refit,
+    settled,
+)
+from ident.rounds import Round, outdone, temper_of
+from ident.screening import screen, signal_scale
+from ident.torque_fit import Fit
+
+RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
+SAME_PERIOD = 0.01  # relative, of two ripples
+REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
+
+
+def weighed_again(
+    problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers
+) -> tuple[Fit, list[Round]]:
+    """``rematched``, and the model pruned where a rival has won: alone it may explain what the loser did beside others."""
+    found, rounds = rematched(problem, current, rounds, workers)
+    return found if found is current else pruned(problem, found), rounds
+
+
+def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> tuple[Fit, list[Round]]:
+    """Causes against their rivals once more, beside all that was found after them.
+
+    In the round in which a cause is named those still missing blur what sets it apart from its rivals.
+    """
+    out = []
+    for found in rounds:
+        winner = found.candidates[0].hypothesis
+        there = {e.hypothesis.key for e in current.model.effects}
+        blurred = len(there) > 1 or outdone(found) or nearly_settled(current)
+        if blurred and winner.key in there and not winner.decoy and not workers.late:
+            current, found = contest(problem, current, found, workers)
+        out.append(found)
+    return current, out
+
+
+def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> tuple[Fit, Round]:
+    """The winner of a round and its rivals, each fitted in its place: the model with the best of them, and the round."""
+    effects = current.model.effects
+    there = {e.hypothesis.key for e in effects}
+    winner = found.candidates[0].hypothesis
+    others = tuple(e for e in effects if e.hypothesis.key != winner.key)
+    own = next(e for e in effects if e.hypothesis.key == winner.key)
+
+    def other(h: Hypothesis) -> bool:
+        """Whether it is not there already: a body with its load is another one than without."""
+        loaded = [x.options.get("with_load") for x in (h, own.hypothesis)]
+        return h.key not in there or (h.key == winner.key and loaded[0] != loaded[1])
+
+    rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
+    rivals = [*rivals[:FINALISTS], *(wider(problem, current, own) if nearly_settled(current) else []), *elsewhere(problem, current, own, others)]
+
+    def entered(effect: Effect) -> Fit | None:
+        model = replace(current.model, effects=(*others, effect))
+        last = refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
+        return last and either_turn(problem, last, last.model.effects[-1], POLISH_STEPS)
+
+    entrants = [own, *rivals] if rivals else []
+    fits = workers.map_in_time(entered, entrants, lambda e: f"again: {e.hypothesis.effect} at {e.hypothesis.place}")
+    ran = [Candidate(e.hypothesis, r, 0.0) for e, r in zip(entrants, fits, strict=True) if r is not None]
+    if len(ran) < 2 or ran[0].hypothesis is not own.hypothesis:
+        return current, found
+    first = ran[0].fit
+    best_of: dict[tuple[str, str], Candidate] = {}
+    for c in sorted(ran, key=lambda c: c.fit.cost):
+        best_of.setdefault(c.hypothesis.key, c)
+    ran = list(best_of.values())
+    excess = model_error(min(c.fit.cost for c in ran), current.count, found.fall)
+    weighed = weigh(ran, excess, temper_of(found.before))
+    best = weighed[0]
+    if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
+        best = next(c for c in weighed if c.hypothesis.key == own.hypothesis.key)
+    elif best.fit is not first:
+        current = polish(problem, best.fit)
+    now = {c.hypothesis.key: c.probability for c in weighed}
+    seen = {c.hypothesis.key for c in found.candidates}
+    new = [c for c in weighed if c.hypothesis.key not in seen]
+    known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
+    known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
+    return current, replace(found, candidates=tuple(known))
+
+
+def elsewhere(problem: Problem, current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:
+    """A ripple as it is screened beside all others: found beside causes that were missing its wave number may be another's."""
+    if RIPPLE not in [q.name for q in own.hypothesis.parameters]:
+        return []
+    without = refit(problem, replace(current.model, effects=tuple(others)), current.weights, current.remainders, FIRST_STEPS)
+    if without is None:
+        return []
+    preds = predictions(problem, without.model, without.remainders)
+    scores = screen(problem, without, preds, [own.hypothesis])
+    found = [Effect(own.hypothesis, clip_to_bounds(own.hypothesis, s.start)) for s in scores if s.start is not None]
+    return [e for e in found if abs(e.value(RIPPLE) / own.value(RIPPLE) - 1.0) > SAME_PERIOD]
+
+
+def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
+    """Laws of the catalogue that hold an effect as a special case, at several shapes: a linear step may not lead there."""
+    h = effect.hypothesis
+    there = {e.hypothesis.key for e in current.model.effects}
+    laws = [
+        x
+        for x in catalogue(problem.structure)
+        if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options and x.key not in there
+    ]
+    if not laws:
+        return []
+    scale = signal_scale(problem, predictions(problem, current.model, current.remainders), h.joint, ())
+    return [Effect(x, clip_to_bounds(x, p)) for x in laws for p in x.options["widens"](effect.p, scale)]
+
+
+def nearly_settled(current: Fit) -> bool:
+    """Whether a little more than noise is left, so that the shape of a law can be what it lacks."""
+    return not settled(current) and current.chi2_per_dof <= FAINT

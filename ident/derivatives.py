@@ -1,0 +1,273 @@
+"""Derivatives of the compared outputs by the fitted coordinates, and the normal equations that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ident.columns import Columns, Products
+from ident.coordinates import coordinate_names, effect_steps, moves_links, pack, shifts_posture, unpack
+from ident.errors_in_variables import impedance_slopes, scatter_information, scatter_slope
+from ident.extended import Effect, Model, Prediction, beside, joints_along_record, predict, predict_at, through_drives
+from ident.group import Group
+from ident.inverse import Motion, baseline_products
+from ident.parallel import map_threads
+from ident.posture import moved_by_posture
+from ident.problem import Problem, Weights, compared_lines, output_error
+from ident.stiction import as_free, held
+
+TIMING_STEP = 1e-6  # s, for differences
+BASELINE_STEP = 1e-3  # of logarithms, for differences
+
+
+def jacobian(
+    problem: Problem, model: Model, group: Group, pred: Prediction, *, exact: bool = False, shifts: bool = False
+) -> Columns:
+    """Derivative of the predicted outputs by the fitted coordinates, at the lines that are compared.
+
+    Args:
+        exact: what moves the links moves the torques of all laws of the gears and the geometric remainder. Both are held
+            without, which beside such laws ends short of the minimum, and tells of less spread than there is.
+        shifts: what moves the arm to another posture moves all lines, to first order, where the remainder is held.
+    """
+    m = len(model.par.to_log())
+    top = compared_lines(group)
+    now = _again(problem, model, group, pred, 1) if exact else pred
+    posture = moved_by_posture(pred)[:, :top] if shifts and not exact and group.window is None else None
+    n, base = model.structure.n, _baseline(model, pred, top)
+    late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
+    late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
+    baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
+    if posture is not None:
+        baseline = baseline.replaced(_sagging(baseline, pred, posture))
+    baseline = baseline.replaced(_passed_on(baseline, model, group, pred))
+    baseline = baseline.replaced(_differences(problem, model, group, pred, now, exact, posture))
+    if not problem.free_timing:
+        baseline.whole[..., baseline.whole_at == m] = 0.0
+    effects = [
+        column
+        for i in range(len(model.effects))
+        for column in _effect_columns(problem, model, group, pred, now, i, exact, posture)
+    ]
+    columns = baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
+    still = held(pred, group)
+    if still is None:
+        return columns
+    # Differences of laws at the motors have it in them.
+    dense, at_motors = columns.dense(), np.array([e.hypothesis.channel == "motor" for e in model.effects for _ in e.p])
+    passed = np.concatenate([np.ones(m + 1, bool), ~at_motors])
+    dense[..., passed] = as_free(dense[..., passed], still, group)
+    return columns.made_whole(dense)
+
+
+def _baseline(model: Model, pred: Prediction, top: int) -> Products:
+    """Derivatives by the log-parameters of the model, without those of hinges that its effects add."""
+    n, n_e = model.structure.n, len(model.structure.elastic)
+    extra = len(pred.structure.elastic) - n_e
+    keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
+    return baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
+
+
+def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps: int) -> Prediction:
+    """What a model near that of ``pred`` predicts, from its geometric remainder, ``steps`` on, and its torques."""
+    return predict(model, group, problem.sampling, W=pred.solution.W, steps=steps, torques=pred.solution.torques)
+
+
+def _sagging(columns: Columns, pred: Prediction, posture: np.ndarray) -> dict[int, np.ndarray]:
+    """Columns of the stiffness of gears that also let the arm sag to another posture."""
+    sag = pred.plane.A_inv[0][:, pred.structure.driven].real * (pred.par.stiffness * pred.solution.delta[:, 0].real)[:, None]
+    held = columns.products.pick(np.arange(sag.shape[-1])).dense()
+    return dict(enumerate(np.moveaxis(held + posture @ sag[:, None], -1, 0)))
+
+
+def _change(group: Group, there: Prediction, base: Prediction, posture: np.ndarray | None) -> np.ndarray:
+    """(S, K, n + M) change of the compared outputs between predictions with one geometric remainder.
+
+    Args:
+        posture: of ``moved_by_posture`` at the compared lines, which stands for what the remainder would do; None holds it.
+    """
+    change = (there.outputs(group) - base.outputs(group))[:, : compared_lines(group)]
+    if posture is None:
+        return change
+    # A plane of its own stands at another posture already.
+    shift = (there.solution.Q_a[:, 0] - base.solution.Q_a[:, 0]).real - (there.plane.lin.q - base.plane.lin.q)
+    return change + np.einsum("slon,sn->slo", posture, shift)
+
+
+def _differences(
+    problem: Problem,
+    model: Model,
+    group: Group,
+    pred: Prediction,
+    now: Prediction,
+    exact: bool,
+    posture: np.ndarray | None,
+) -> dict[int, np.ndarray]:
+    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` the links, by differences from ``now``.
+
+    These laws move with the gear's spring and damper; and where the recorded torque says its deflection, with what
+    the motor takes of that, and with the timing.
+    """
+    n, m = model.structure.n, len(model.par.to_log())
+    along = joints_along_record(model, group)
+    gears = {e.hypothesis.joint for e in model.effects if e.hypothesis.gear_law}
+    steps = {f * n + j: BASELINE_STEP for j in gears for f in range(4 if j in along else 2)}
+    if exact:
+        steps |= dict.fromkeys(np.flatnonzero(moves_links(model)[:m]).tolist(), BASELINE_STEP)
+    if along:
+        steps[m] = TIMING_STEP
+    x = pack(model)
+
+    def column(c: int, step: float) -> np.ndarray:
+        there = unpack(model, x + step * (np.arange(len(x)) == c), np.inf)
+        return _change(group, _again(problem, there, group, pred, int(exact)), now, posture) / step
+
+    return {c: column(c, step) for c, step in steps.items()}
+
+
+def _passed_on(columns: Columns, model: Model, group: Group, pred: Prediction) -> dict[int, np.ndarray]:
+    """Baseline columns of the torque that drives with effects pass on; none where there are no such drives."""
+    drives = _drives(model)
+    if not drives:
+        return {}
+    dense = columns.dense()
+    for effect in drives:
+        j, motion = effect.hypothesis.joint, pred.motion(group)
+        full = np.zeros((dense.shape[-1], *pred.U.shape[:2]), complex)
+        full[:, :, : dense.shape[1]] = np.moveaxis(dense[:, :, j], -1, 0)
+        passed = _change_passed(effect, motion, full)
+        dense[:, :, j] = np.moveaxis(passed[:, :, : dense.shape[1]], 0, -1)
+    return dict(enumerate(np.moveaxis(dense, -1, 0)))
+
+
+def _drives(model: Model) -> list[Effect]:
+    """Effects of the drives, in the order in which they act."""
+    return [e for e in model.effects if e.hypothesis.channel == "drive"]
+
+
+def _change_passed(drive: Effect, motion: Motion, X: np.ndarray) -> np.ndarray:
+    """A change (..., S, L) of the torque before a drive with an effect, as it is after it."""
+    h, k = drive.hypothesis, motion.par.stiffness[drive.hypothesis.joint]
+    return h.law(drive.p, motion, h.joint, k, X) - h.law(drive.p, motion, h.joint, k, 0 * X)
+
+
+def _effect_columns(
+    problem: Problem,
+    model: Model,
+    group: Group,
+    pred: Prediction,
+    now: Prediction,
+    i: int,
+    exact: bool,
+    posture: np.ndarray | None,
+) -> list[np.ndarray]:
+    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences from ``now``."""
+    effect = model.effects[i]
+    h, steps, top = effect.hypothesis, effect_steps(effect), compared_lines(group)
+    if h.channel == "motor" and not joints_along_record(model, group):
+        return [column[:, :top] for column in _motor_columns(model, group, pred, effect, steps)]
+    if h.channel == "drive":
+        return [column[:, :top] for column in _drive_columns(model, group, pred, effect, steps)]
+    models = [
+        Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
+        for p, _ in steps
+    ]
+    if exact or h.channel == "model":
+        base, posture = now if exact else _again(problem, model, group, pred, 1), None
+        moved = [_again(problem, m, group, pred, 1) for m in models]
+    else:
+        base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}
+        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
+    return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]
+
+
+def _motor_columns(
+    model: Model, group: Group, pred: Prediction, effect: Effect, steps: Sequence[tuple[np.ndarray, float]]
+) -> list[np.ndarray]:
+    """Derivatives by a law at the motor: the motion does not change, and only its own torque does."""
+    h, j = effect.hypothesis, effect.hypothesis.joint
+    motion = beside(model.effects, effect, pred.motion(group))
+    k = pred.par.stiffness[j]
+    now, columns = h.law(effect.p, motion, j, k), []
+    drives = [e for e in _drives(model) if e.hypothesis.joint == j]
+    for p, step in steps:
+        X = pred.plane.record * motion.lines(h.law(p, motion, j, k) - now)
+        for drive in drives:
+            X = _change_passed(drive, motion, X)
+        out = np.zeros((*pred.U.shape[:2], model.structure.n + len(group.links)), complex)
+        out[..., j] = X / step
+        columns.append(out)
+    return columns
+
+
+def _drive_columns(
+    model: Model, group: Group, pred: Prediction, effect: Effect, steps: Sequence[tuple[np.ndarray, float]]
+) -> list[np.ndarray]:
+    """Derivatives by a drive with an effect: what it is given does not change."""
+    motion, n, columns = pred.motion(group), model.structure.n, []
+    drives = _drives(model)
+    for p, step in steps:
+        out = np.zeros((*pred.U.shape[:2], n + len(group.links)), complex)
+        out[..., :n] = through_drives([replace(e, p=p) if e is effect else e for e in drives], motion) - pred.U
+        columns.append(out / step)
+    return columns
+
+
+def jacobians(problem: Problem, model: Model, preds: Sequence[Prediction], *, exact: bool) -> list[Columns]:
+    """``jacobian`` of all groups."""
+    of = partial(jacobian, problem, model, exact=exact, shifts=shifts_posture(model))
+    return map_threads(lambda x: of(*x), zip(problem.groups, preds, strict=True))
+
+
+def normal_equations(
+    problem: Problem, columns: Sequence[Columns], preds: Sequence[Prediction], weights: Weights
+) -> tuple[np.ndarray, np.ndarray]:
+    def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
+        group = problem.groups[g]
+        error = output_error(group, preds[g])
+        if group.window is None:
+            return columns[g].normal(weights.whiten[g], error)
+        J = as_real(weights.apply(g, group.observe_outputs(columns[g].dense())))
+        r = as_real(weights.apply(g, error)[..., None])[:, 0]
+        return J.T @ J, J.T @ r
+
+    H, b = zip(*map_threads(of_group, range(len(problem.groups))), strict=True)
+    return sum(H), sum(b)
+
+
+def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """What noise adds to the right-hand side of ``normal_equations`` (``errors_in_variables``)."""
+    m, count = len(model.par.to_log()), len(coordinate_names(model))
+
+    def others(group: Group, pred: Prediction, K: int) -> Iterator[tuple[int, np.ndarray]]:
+        if problem.free_timing:
+            yield m, pred.plane.s[:K, None, None] * pred.sampled_impedance[:K]
+        at = m + 1
+        for i, effect in enumerate(model.effects):
+            slopes = impedance_slopes(model, group, pred, problem.sampling, i, effect_steps(effect))
+            yield from ((at + c, slope) for c, slope in enumerate(slopes))
+            at += len(effect.p)
+
+    def of_group(of: tuple[Group, Prediction, np.ndarray]) -> np.ndarray:
+        group, pred, whiten = of
+        K = len(whiten)
+        return scatter_slope(group, pred, whiten, _baseline(model, pred, K), others(group, pred, K), count)
+
+    return sum(map_threads(of_group, zip(problem.groups, preds, weights.whiten, strict=True)))
+
+
+def shared_information(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
+    """What noise adds to the normal matrix of the baseline parameters."""
+    each = zip(problem.groups, preds, weights.whiten, strict=True)
+    return sum(scatter_information(g, pred, whiten, _baseline(model, pred, len(whiten))) for g, pred, whiten in each)
+
+
+def as_real(X: np.ndarray) -> np.ndarray:
+    """Complex (..., p) as real rows (2 x rows, p): real parts, then imaginary parts."""
+    X = X.reshape(-1, X.shape[-1])
+    out = np.empty((2 * len(X), X.shape[-1]))
+    out[: len(X)], out[len(X) :] = X.real, X.imag
+    return out

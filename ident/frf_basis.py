@@ -1,0 +1,128 @@
+"""What all estimators of FRFs share: their result, the segments and lines that it comes from, and covariances over lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import digamma
+
+from ident.dataset import Dataset, Segment
+from ident.group import mean_over_lines
+from robot_assets.errors import DataError
+
+SMOOTH = 3  # lines on either side over which a covariance of few degrees of freedom is smoothed
+ENOUGH = 8  # degrees of freedom from which a variance is taken as it is
+
+
+@dataclass(frozen=True)
+class FRF:
+    """FRFs at Q operating points and F excited lines.
+
+    Attributes:
+        G: (Q, F, n, n) (rad/s2)/(N m).
+        covariance: (Q, F, n n, n n) of vec G, columns stacked; of the estimate, not of one period.
+        noise_std: (Q, F, n, n) standard deviation by measurement noise alone.
+        total_std: (Q, F, n, n) with stochastic nonlinear distortion where realizations show it.
+        frequency: (F,) Hz. lines: (F,).
+        operating_points: names. q0: (Q, n) rad, mean motor position.
+        amplitude: relative level. realizations, periods: averaged; the fewest of all points.
+        estimator: of ``ESTIMATORS`` or ``LOCAL``.
+    """
+
+    G: np.ndarray
+    covariance: np.ndarray
+    noise_std: np.ndarray
+    total_std: np.ndarray
+    frequency: np.ndarray
+    lines: np.ndarray
+    operating_points: tuple[str, ...]
+    q0: np.ndarray
+    amplitude: float
+    realizations: int
+    periods: int
+    estimator: str
+
+
+def frf_levels(dataset: Dataset, *, role: str = "identification") -> tuple[float, ...]:
+    """Excitation levels of the multisine segments of a role, highest first."""
+    return tuple(sorted({float(s.amplitude) for s in _periodic(dataset, role)}, reverse=True))
+
+
+def choose_segments(
+    dataset: Dataset, role: str, amplitude: float | None = None
+) -> tuple[dict[str, list[Segment]], float]:
+    """Multisine segments of a role at one level, by operating point, and that level; the highest where None.
+
+    Raises:
+        DataError: where there are none.
+    """
+    segments = _periodic(dataset, role)
+    if not segments:
+        raise DataError("multisine segments", dataset.name, f"none of role {role}", "at least n per operating point")
+    level = max(s.amplitude for s in segments) if amplitude is None else amplitude
+    points: dict[str, list[Segment]] = {}
+    for s in segments:
+        if np.isclose(s.amplitude, level):
+            points.setdefault(str(s.operating_point), []).append(s)
+    if not points:
+        raise DataError("amplitude", dataset.name, f"{level:g}", f"one of {frf_levels(dataset, role=role)}")
+    return points, float(level)
+
+
+def _periodic(dataset: Dataset, role: str) -> list[Segment]:
+    return [s for s in dataset.select(role=role, kind="multisine") if len(s.excited_lines)]
+
+
+def sample_noise_power(dataset: Dataset, period: int, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Power (F, n) that white sample noise leaves in a line of torque and of acceleration."""
+    robot = dataset.robot
+    tau = np.asarray(robot.array("tau_std") if dataset.tau_std is None else dataset.tau_std, float)
+    q = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
+    one = np.ones((len(frequency), 1))
+    return one * tau**2 / period, (2 * np.pi * frequency[:, None]) ** 4 * q**2 / period
+
+
+def common_lines(segments: list[Segment], dataset: Dataset) -> np.ndarray:
+    first = segments[0]
+    lines = np.asarray(first.excited_lines, int)
+    for s in segments:
+        if s.period != first.period:
+            raise DataError("period", s.name, str(s.period), f"{first.period} as in {first.name}")
+        lines = np.intersect1d(lines, s.excited_lines)
+    if not len(lines):
+        raise DataError("excited_lines", dataset.name, "no line that all segments share", "a common grid")
+    return lines
+
+
+def kron_by_line(K: np.ndarray, Phi: np.ndarray) -> np.ndarray:
+    """Kronecker product line by line; (F, n n, n n)."""
+    F, n, _ = K.shape
+    return np.einsum("fjl,fik->fjilk", K, Phi).reshape(F, n * n, n * n)
+
+
+def steadied(Phi: np.ndarray, dof: int, shape: np.ndarray) -> np.ndarray:
+    """(F, n, n) sample covariances of few degrees of freedom, steadied over neighbouring lines.
+
+    Variances: mean of the logarithms of their ratio to ``shape`` (F, n) over just enough lines,
+    freed of its bias ``digamma(dof) - ln dof``. Correlations: mean over ``SMOOTH`` lines on either side; where even
+    that is short of rank they are drawn towards zero.
+    """
+    n = Phi.shape[1]
+    k = np.arange(n)
+    variance = np.maximum(Phi[:, k, k].real, 1e-300)
+    root = np.sqrt(variance)
+    half = min(SMOOTH, int(np.ceil((ENOUGH / dof - 1) / 2)))
+    if half > 0:
+        variance = shape * np.exp(mean_over_lines(np.log(variance / shape), half) - digamma(dof) + np.log(dof))
+    correlation = Phi / (root[:, :, None] * root[:, None, :])
+    if dof < ENOUGH * n:
+        correlation = mean_over_lines(correlation, SMOOTH) * min(1.0, dof * (2 * SMOOTH + 1) / (ENOUGH * n))
+        correlation[:, k, k] = 1.0
+    scale = np.sqrt(variance)
+    return scale[:, :, None] * correlation * scale[:, None, :]
+
+
+def unvec(x: np.ndarray, n: int) -> np.ndarray:
+    """(F, n n) of stacked columns to (F, n, n)."""
+    return np.swapaxes(x.reshape(-1, n, n), -1, -2)

@@ -1,0 +1,266 @@
+"""A group of records at one operating point as spectra, and what of them is signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.fft
+
+SURE, CREEPING = 3.0, 0.02  # standard deviations of a velocity, and share of its rms, below which a motor may as well rest
+NOISE_LINES = 10  # lines on either side over which the noise of the position is averaged
+SIGNAL_LEVEL = 2.0  # power over noise below which a line of the position counts as noise
+FAST_LEVEL = 1.5  # the same of the mean power of lines near by: that of noise alone differs by less from its own mean
+
+
+@dataclass(frozen=True)
+class Group:
+    """Periodic records that share posture and frequency grid.
+
+    Spectra are ``rfft(x) / period``: ``x(t) = X_0 + 2 Re sum_k X_k exp(j k 2 pi t / T)``.
+
+    Attributes:
+        operating_point: name of the posture, or of the segment for a motion.
+        segments: names, S of them.
+        U, Q: (S, L, n) mean spectra of torque (N m) and motor position (rad), lines 0..L-1.
+        U_periods, Q_periods: (S, P, L, n) single periods, P >= 1.
+        Q_link: (S, L, n) of the link encoders, or None.
+        link_std: (n,) sample noise of the link encoders of a motion, rad, NaN where a joint has none; or None.
+        links: joints whose link encoder is compared, M of them.
+        n_slow: lines of the motion along which the geometry of the arm is solved, all where None.
+        omega: (L,) rad/s.
+        n_compared: lines that are compared, K of them: 0..K-1.
+        excited: (S, L) True where a segment excites.
+        n_time: points of the time grid over one period.
+        window: (n_time,) weight of a motion in the time domain, or None for periodic data.
+        amplitude: (S,) relative level.
+        start: (S,) s, time of the first sample of the middle period, for drift over the recording.
+        temperature: (S, n) degC means, or None.
+        period_time: s.
+        periods: (S,) number of periods averaged.
+        rest: (S, n_time, n) where motors stand still, or turn.
+        Q_fast: (S, F, n) mean spectra of the position beyond lines 0..L-1, as far as they are signal and the time grid reaches;
+            None of a motion.
+        white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
+            rad2 and N2 m2.
+    """
+
+    operating_point: str
+    segments: tuple[str, ...]
+    U: np.ndarray
+    Q: np.ndarray
+    U_periods: np.ndarray
+    Q_periods: np.ndarray
+    Q_link: np.ndarray | None
+    omega: np.ndarray
+    n_compared: int
+    excited: np.ndarray
+    n_time: int
+    window: np.ndarray | None
+    amplitude: np.ndarray
+    start: np.ndarray
+    temperature: np.ndarray | None
+    period_time: float
+    periods: np.ndarray
+    white_noise: np.ndarray
+    white_torque_noise: np.ndarray
+    rest: np.ndarray | None = None
+    Q_fast: np.ndarray | None = None
+    link_std: np.ndarray | None = None
+    links: tuple[int, ...] = ()
+    n_slow: int | None = None
+
+    @property
+    def outputs(self) -> np.ndarray:
+        """(S, L, n + M) what is compared: recorded torque, N m, then link positions, rad."""
+        return self.U if not self.links else np.concatenate([self.U, self.Q_link[..., list(self.links)]], axis=-1)
+
+    @cached_property
+    def scatter(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Covariances (K, n, n) of torque, of torque and position, and of position, of noise of the means; sums over records.
+
+        By the scatter between periods; None where there is one period, and beside link encoders.
+        """
+        periods = self.U_periods.shape[1]
+        if periods < 2 or self.links:
+            return None
+        U, Q = (
+            (x - x.mean(axis=1, keepdims=True))[:, :, : self.n_compared].transpose(2, 3, 0, 1).reshape(self.n_compared, x.shape[-1], -1)
+            for x in (self.U_periods, self.Q_periods)
+        )
+        scale = periods * (periods - 1)
+        return tuple(a @ b.conj().swapaxes(1, 2) / scale for a, b in ((U, U), (U, Q), (Q, Q)))
+
+    @cached_property
+    def position_noise(self) -> np.ndarray:
+        """(L, n) variance of a line of the mean position, rad2.
+
+        By the scatter between periods; white where there is one period, by the noise of its samples.
+        """
+        return line_noise(self.Q_periods, self.white_noise)
+
+    @cached_property
+    def signal_share(self) -> np.ndarray:
+        """(S, L, n) share of each line of the position that is signal, 0 to 1.
+
+        Laws that turn on a reversal see a noisy position reverse where the joint stands still; they
+        are shown the motion without the lines that hold noise alone.
+        """
+        return signal_share(self.Q, self.position_noise)
+
+    @cached_property
+    def shown_error(self) -> np.ndarray:
+        """(S, L, n) power by which that motion is off, rad2: the noise it holds, and the signal it has lost.
+
+        By Stein's unbiased estimate (Stein 1981), in the mean over lines near by, which takes away most of its own scatter; what
+        is below zero then counts as none.
+        """
+        noise, power = self.position_noise, np.abs(self.Q) ** 2
+        least = SIGNAL_LEVEL * noise
+        risk = np.where(power > least, noise + least**2 / np.maximum(power, 1e-300), power - noise)
+        risk[:, 0] = noise[0]  # the mean is shown as it is
+        mean = mean_over_lines(risk.swapaxes(0, 1), NOISE_LINES).swapaxes(0, 1)
+        mean[:, 0] = 0.0
+        return np.maximum(mean, 0.0)
+
+    @cached_property
+    def slow_velocity(self) -> np.ndarray:
+        """(S, n_time, n) motor velocity in lines 0..L-1, without those of noise alone, rad/s."""
+        return self.to_time(1j * self.omega[:, None] * self.signal_share * self.Q)
+
+    @cached_property
+    def velocity_error(self) -> np.ndarray:
+        """(S, n) by which that is off, rad/s rms."""
+        return np.sqrt(2.0 * np.sum(self.omega[:, None] ** 2 * self.shown_error, axis=1))
+
+    @cached_property
+    def turn_noise(self) -> np.ndarray:
+        """(n,) the same in the mean over records."""
+        return np.sqrt(np.mean(self.velocity_error**2, axis=0))
+
+    @cached_property
+    def least_velocity(self) -> np.ndarray:
+        """(S, n) below which a motor may as well rest: what its velocity is off by, or little, rad/s."""
+        return np.maximum(SURE * self.velocity_error, CREEPING * np.sqrt(np.mean(self.slow_velocity**2, axis=1)))
+
+    @cached_property
+    def fast_velocity(self) -> np.ndarray | None:
+        """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps; None of a motion."""
+        if self.Q_fast is None:
+            return None
+        L, count = len(self.omega), self.Q_fast.shape[1]
+        V = np.zeros((len(self.Q_fast), L + count, self.Q_fast.shape[2]), complex)
+        V[:, L:] = 2j * np.pi / self.period_time * np.arange(L, L + count)[:, None] * self.Q_fast
+        return self.to_time(V)
+
+    @cached_property
+    def torque_share(self) -> np.ndarray:
+        """(S, L, n) the same of the torque: a law that clips it would clip its noise, and so explain that."""
+        return signal_share(self.U, self.torque_noise)
+
+    @cached_property
+    def torque_noise(self) -> np.ndarray:
+        """(L, n) variance of a line of the mean torque, N2 m2, as that of the position."""
+        return line_noise(self.U_periods, self.white_torque_noise)
+
+    @property
+    def posture(self) -> np.ndarray:
+        """(n,) mean motor position, rad."""
+        return self.Q[:, 0].real.mean(axis=0)
+
+    def pick(self, rows: np.ndarray) -> Group:
+        """The group with some of its segments."""
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods", "rest", "Q_fast")
+        parts = {name: getattr(self, name) for name in names}
+        kept = {name: None if x is None else x[rows] for name, x in parts.items()}
+        return replace(self, segments=tuple(self.segments[i] for i in rows), **kept)
+
+    def slow(self) -> Group:
+        """The group with the lines of the geometry alone."""
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link")
+        parts = {name: getattr(self, name) for name in names}
+        cut = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
+        return replace(self, omega=self.omega[: self.n_slow], excited=self.excited[:, : self.n_slow], n_slow=None, Q_fast=None, **cut)
+
+    @property
+    def window_share(self) -> float:
+        """Share of the power of a record that its window leaves; 1 where there is none."""
+        return 1.0 if self.window is None else float(np.mean(self.window**2))
+
+    def to_time(self, X: np.ndarray) -> np.ndarray:
+        """Spectrum (..., L, m) on the time grid (..., n_time, m)."""
+        return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward")
+
+    def to_lines(self, x: np.ndarray) -> np.ndarray:
+        """Time grid (..., n_time, m) to spectrum (..., L, m)."""
+        full = scipy.fft.rfft(x, axis=-2, norm="forward")
+        return full[..., : len(self.omega), :]
+
+    @cached_property
+    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """(K, L) of a line, and of its conjugate, that the window shows at each compared one."""
+        W = scipy.fft.fft(self.window, norm="forward")
+        k, l = np.arange(self.n_compared)[:, None], np.arange(len(self.omega))
+        of_conjugate = W[(k + l) % len(W)]
+        of_conjugate[:, 0] = 0.0  # the mean has no conjugate
+        return W[(k - l) % len(W)], of_conjugate
+
+    def observe(self, X: np.ndarray) -> np.ndarray:
+        """What of a torque spectrum (..., L, m) is compared: its windowed lines (..., K, m).
+
+        The window in time is a convolution of the few lines there are, far cheaper than two transforms.
+        """
+        if self.window is None:
+            return X[..., : self.n_compared, :]
+        of_line, of_conjugate = self._seen
+        X = np.concatenate([X[..., :1, :].real, X[..., 1:, :]], axis=-2)  # as a time signal has it
+        return of_line @ X + of_conjugate @ X.conj()
+
+    def observe_outputs(self, X: np.ndarray) -> np.ndarray:
+        """``observe`` for outputs (S, L, n + M, ...); (S, K, n + M, ...).
+
+        The zero of a link encoder is not known: its mean over the window is left out.
+        """
+        flat = X.reshape(*X.shape[:2], -1)
+        if self.links:
+            first = self.U.shape[-1] * flat.shape[-1] // X.shape[2]
+            share = self.window**2 / np.sum(self.window**2)
+            flat = flat.copy()
+            flat[:, 0, first:] -= np.einsum("t,stm->sm", share, self.to_time(flat[..., first:]))
+        return self.observe(flat).reshape(len(X), self.n_compared, *X.shape[2:])
+
+
+def line_noise(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """(L, n) variance of a line of the mean over periods (S, P, L, n)."""
+    P = X_periods.shape[1]
+    if P < 2:
+        return np.ones((X_periods.shape[2], 1)) * white
+    d = X_periods - X_periods.mean(axis=1, keepdims=True)
+    power = np.sum(np.abs(d) ** 2, axis=(0, 1)) / (len(d) * (P - 1) * P)
+    return mean_over_lines(power, NOISE_LINES)
+
+
+def signal_power(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """Mean (S, L, n) over periods (S, P, L, n) of lines that hold little but noise, each by the share of signal near by (Wiener 1949)."""
+    mean = X_periods.mean(axis=1)
+    if not mean.shape[1]:
+        return mean
+    power = mean_over_lines((np.abs(mean) ** 2).swapaxes(0, 1), NOISE_LINES).swapaxes(0, 1)
+    noise = line_noise(X_periods, white)
+    return np.maximum(1.0 - FAST_LEVEL * noise / np.maximum(power, 1e-300), 0.0) * mean
+
+
+def signal_share(X: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Share of each line (S, L, ...) that is signal, of which ``noise`` (L, ...) is the variance; the mean is."""
+    share = np.maximum(1.0 - SIGNAL_LEVEL * noise / np.maximum(np.abs(X) ** 2, 1e-300), 0.0)
+    share[:, 0] = 1.0
+    return share
+
+
+def mean_over_lines(x: np.ndarray, half: int) -> np.ndarray:
+    """Mean of (L, ...) over lines l - half .. l + half."""
+    total = np.cumsum(np.concatenate([np.zeros_like(x[:1]), x]), axis=0)
+    at = np.arange(len(x))
+    low, high = np.maximum(at - half, 0), np.minimum(at + half + 1, len(x))
+    return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (x.ndim - 1))

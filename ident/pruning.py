@@ -1,0 +1,144 @@
+"""What a model does not need: effects of which nothing is left, laws without what sets them apart, frictions that stood for a later cause."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ident.evidence import ABSENT, WAVE, is_wave, pointless
+from ident.extended import Effect, Model, joints_along_record
+from ident.group import Group
+from ident.hypotheses import Hypothesis
+from ident.parallel import Workers
+from ident.problem import Problem
+from ident.refits import POLISH_STEPS, clip_to_bounds, polish, refit, reweighted
+from ident.rounds import MIN_EVIDENCE, Round
+from ident.torque_fit import Fit
+
+UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
+NEXT_TO_REST = 2.0  # velocity over that at which a motor may as well rest, up to which friction may stand for what holds it then
+
+
+def pruned(problem: Problem, current: Fit) -> Fit:
+    """The model without effects of which nothing is left.
+
+    One that stood for a part of a cause as long as that had no name is not needed beside it; and one that won only since
+    the drives found a better place in its company says nothing: that place is the baseline's then.
+    """
+    std = dict(zip(current.names, np.sqrt(np.maximum(np.diag(current.covariance()), 0.0)), strict=True))
+
+    def nothing(effect: Effect) -> bool:
+        if pointless(effect, current.model.par.stiffness[effect.hypothesis.joint]):
+            return True
+        h = effect.hypothesis
+        own = [(q, v, std[h.coordinate(q.name)]) for q, v in zip(h.parameters, effect.p, strict=True) if not q.nuisance]
+        off = [abs(q.to_internal(v) - q.to_internal(q.null)) / s for q, v, s in own if q.null is not None]
+        # The wave number of a wave that is not there may look sure.
+        wave = is_wave(h.parameters)
+        sizes = [s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in own if q.null is None and (not wave or q.name in WAVE)]
+        return all(sizes) if sizes else all(x < ABSENT for x in off)
+
+    effects = current.model.effects
+    needed = tuple(e for e in effects if e.hypothesis.options.get("baseline") or not nothing(e))
+    if len(needed) == len(effects):
+        return current
+    other = polish(problem, replace(current, model=replace(current.model, effects=needed)))
+    same = reweighted(problem, current, other.weights)
+    return other if other.cost - same.cost < MIN_EVIDENCE * max(1.0, same.cost / same.count) else current
+
+
+def without_shadows(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> Fit:
+    """The model without companions of a friction that the data do not need beside a cause that was found after them.
+
+    They competed with no other hypothesis, and made up for that cause as long as it was missing.
+    """
+    alone = {r.candidates[0].hypothesis.key for r in rounds if len(r.candidates) == 1 and r.before is not rounds[-1].before}
+    doubted = [e.hypothesis for e in current.model.effects if e.hypothesis.key in alone]
+    if not doubted or workers.late:
+        return current
+
+    def without(gone: Sequence[Hypothesis]) -> Model:
+        keys = {h.key for h in gone}
+        return replace(current.model, effects=tuple(e for e in current.model.effects if e.hypothesis.key not in keys))
+
+    def rise(gone: Sequence[Hypothesis]) -> float:
+        other = refit(problem, without(gone), current.weights, current.remainders, POLISH_STEPS)
+        return np.inf if other is None else other.cost - current.cost
+
+    def least(h: Hypothesis) -> float:
+        """By what is left at its own joint: what is left at another, far above a smaller noise, says nothing of it."""
+        left = current.chi2_per_dof if h.on_chain else current.costs[h.joint] / current.counts[h.joint]
+        return MIN_EVIDENCE * max(1.0, left)
+
+    rises = workers.map_in_time(lambda h: rise([h]), doubted, lambda h: f"without: {h.effect} at {h.place}")
+    gone = [h for h, x in zip(doubted, rises, strict=True) if x is not None and x < least(h)]
+    if not gone or (len(gone) > 1 and rise(gone) >= sum(map(least, gone))):
+        return current
+    return polish(problem, replace(current, model=without(gone)))
+
+
+def renamed(rounds: Sequence[Round], before: Sequence[Effect], after: Sequence[Effect]) -> list[Round]:
+    """Rounds whose winners have been replaced by their special cases, effect by effect."""
+    new = {a.hypothesis.key: b.hypothesis for a, b in zip(before, after, strict=True) if a.hypothesis is not b.hypothesis}
+
+    def of(found: Round) -> Round:
+        first, *others = found.candidates
+        h = new.get(first.hypothesis.key, first.hypothesis)
+        return replace(found, candidates=(replace(first, hypothesis=h), *(c for c in others if c.hypothesis.key != h.key)))
+
+    return [of(r) for r in rounds]
+
+
+def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kept: set[tuple[str, str]]) -> Fit:
+    """The model with the special case in place of effects of which the data do not show what sets them apart from it.
+
+    Args:
+        kept: keys of effects that stay as they are.
+    """
+    known = {h.key: h for h in hypotheses}
+    special_by_itself = partial(plainly_special, problem, result.model)
+    std = dict(zip(result.names, np.sqrt(np.maximum(np.diag(result.covariance()), 0.0)), strict=True))
+
+    def plain(effect: Effect) -> Effect:
+        h = effect.hypothesis
+        special = known.get((h.options.get("absorbs", ""), h.place))
+        if h.key in kept or special is None or "apart" not in h.options:
+            return effect
+        hidden = h.options.get("give", lambda p: np.inf)(effect.p) < problem.q_std[h.joint]
+        if std[h.coordinate(h.options['apart'])] < UNTOLD and not hidden and not special_by_itself(effect):
+            return effect
+        return Effect(special, clip_to_bounds(special, h.options["special"](effect.p)))
+
+    effects = tuple(plain(e) for e in result.model.effects)
+    swapped = sum(a is not b for a, b in zip(effects, result.model.effects, strict=True))
+    if not swapped:
+        return result
+    other = polish(problem, replace(result, model=replace(result.model, effects=effects)))
+    same = reweighted(problem, result, other.weights)
+    scale = max(1.0, same.cost / same.count)
+    # One that has reached what makes it its special case is that one, whatever errors of the law make of the rest.
+    certain = all(a is b or special_by_itself(a) for a, b in zip(result.model.effects, effects, strict=True))
+    return other if certain or other.cost - same.cost < swapped * MIN_EVIDENCE * scale else result
+
+
+def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
+    """Whether an effect is its special case by its parameters, or beside laws along the record.
+
+    Along the record nothing says what friction takes of the torque while a motor rests: what a friction has within velocities at
+    which it may as well rest is an error of that.
+    """
+    h = effect.hypothesis
+    if h.options.get("plain", lambda p: False)(effect.p):
+        return True
+    if "within" not in h.options:
+        return False
+    v = h.options["within"](effect.p)
+
+    def unseen(group: Group) -> bool:
+        rests = group.rest is not None and bool(np.any(group.rest[..., h.joint]))
+        return rests and h.joint in joints_along_record(model, group) and v < NEXT_TO_REST * group.least_velocity[:, h.joint].mean()
+
+    return all(map(unseen, problem.groups))

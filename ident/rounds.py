@@ -1,0 +1,205 @@
+"""One round of attribution: every hypothesis screened, the best refitted, and weighed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.baseline import DETECTION_EXCESS, implausible
+from ident.evidence import (
+    LAW_ERROR,
+    TEMPER,
+    TEMPER_OF_NOISE,
+    Candidate,
+    explained,
+    last_is_pointless,
+    rivals_of_best,
+    weigh,
+)
+from ident.hypotheses import Hypothesis
+from ident.parallel import Workers
+from ident.problem import Problem
+from ident.refits import FAINT, FINALISTS, left_by, refit, reweighted, settled, under_own_noise
+from ident.screening import Score
+from ident.search import MIN_SHARE, STRONG, explore, explore_softly, under_noise_of_best
+from ident.strong import beside_strong
+from ident.torque_fit import Fit
+
+SETTLED = 0.05  # share of the excess up to which what is left needs no second search
+NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
+SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
+MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of attribution: what competed, and who won.
+
+    ``before`` is the model without a new cause, its cost under the weights of the candidates; ``explained`` is the
+    share of its excess over noise that the winner explains.
+    """
+
+    before: Fit
+    candidates: tuple[Candidate, ...]
+    scores: tuple[Score, ...]
+    scale: float
+    explained: float
+
+    @property
+    def fall(self) -> float:
+        """Of the cost, by the winner."""
+        return self.before.cost - self.candidates[0].fit.cost
+
+
+def left_share(baseline: Fit, current: Fit) -> float:
+    """Share of the discrepancy of the baseline that a model leaves, 0 to 1."""
+    before = max(baseline.chi2_per_dof - 1.0, 1e-12)
+    return float(np.clip((current.chi2_per_dof - DETECTION_EXCESS) / before, 0.0, 1.0))
+
+
+def told_share(baseline: Fit, found: Round) -> float:
+    """Share of the discrepancy of the baseline that a round explains; more than 1 of one within the error of the noise."""
+    return found.fall / max(baseline.cost - DETECTION_EXCESS * baseline.count, 1.0)
+
+
+def answers(found: Round, least: float = MIN_EVIDENCE) -> bool:
+    """Whether the best candidate of a round explains enough to be a cause, ``least`` of the scaled cost."""
+    return bool(found.candidates) and found.fall >= least * found.scale and found.explained >= MIN_SHARE
+
+
+def with_name(found: Round) -> Round:
+    """A round that a decoy has won, won by the law of the catalogue that it holds, or by one that explains nearly as much.
+
+    Beside causes that are still missing what sets them apart means little: the decoy is a rival again at the end.
+    """
+    best, *others = found.candidates
+    first = best.hypothesis
+    if not first.decoy or first.options.get("baseline"):
+        return found
+    named = [c for c in others if c.hypothesis.key == (first.options.get("absorbs"), first.place)]
+    if not named:
+        least = NEARLY * found.fall
+        named = [c for c in others if not c.hypothesis.decoy and found.before.cost - c.fit.cost >= least][:1]
+    return replace(found, candidates=(*named, *(c for c in found.candidates if c not in named))) if named else found
+
+
+def outdone(found: Round) -> bool:
+    """Whether a decoy does better than the cause that a round has named."""
+    best = max(found.candidates, key=lambda c: c.probability)
+    return best.hypothesis.decoy and best is not found.candidates[0]
+
+
+def attribute_once(
+    problem: Problem,
+    current: Fit,
+    hypotheses: Sequence[Hypothesis],
+    workers: Workers,
+    least: float,
+    bare: float,
+    quiet: frozenset[int] = frozenset(),
+) -> Round:
+    """One round: screen all, refit the best, weigh them.
+
+    A strong cause may have spoilt the model from which others are sought, so that none of them answers;
+    candidates are then also sought from a softened model. All are compared under the same weights.
+
+    Args:
+        least, bare: as of ``search.explore``, from the model as it is.
+        quiet: joints at which no strong effect is sought, and what is left asks for no hinge.
+    """
+    before, softly = current, {}
+    found, scores = explore(problem, current, hypotheses, least, bare, workers, quiet=quiet)
+    excess = max(current.cost - current.count, 1.0)
+    told = bool(found) and settles_its_joint(problem, current, *found[0])
+    if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not told and not workers.late:
+        before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
+    best: dict[int, tuple[Hypothesis, Fit]] = {}
+    for h, result in found:
+        if not last_is_pointless(result) and (id(h) not in best or result.cost < best[id(h)][1].cost):
+            best[id(h)] = h, result
+    ranked = sorted(best.values(), key=lambda x: x[1].cost)
+    if ranked:
+        before, ranked = under_noise_of_best(problem, before, ranked, workers)
+    if leaves_much(problem, before, ranked) and not told and not workers.late:
+        before, ranked = beside_strong(problem, before, ranked, scores, workers, quiet)
+    return weighed_round(before, ranked, scores, softly)
+
+
+def leaves_much(problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]) -> bool:
+    """Whether the best candidate leaves so much that a strong effect may be missing.
+
+    That is anything clearly above the noise where the drives cannot be those of the arm, or where the arm may have several steady
+    motions under the law of the best; else more than what is faint, and than errors of its law.
+    """
+    bent = bool(ranked) and "bends" in ranked[0][0].options
+    spoilt = not problem.motions_alone and (bent or implausible(problem, before))
+    excess = before.cost - before.count
+    allowed = SPOILT * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * excess)
+    return min(excess, left_by(ranked)) > allowed
+
+
+def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozenset[int]:
+    """Joints at which next to nothing is left beside what a cause there has explained, all in the noise of the model as it is."""
+    left = current.costs - current.counts
+    out = set()
+    for found in rounds:
+        j = found.candidates[0].hypothesis.joint
+        if j >= 0 and left[j] < LAW_ERROR * (reweighted(problem, found.before, current.weights).costs[j] - current.costs[j]):
+            out.add(j)
+    return frozenset(out)
+
+
+def settles_its_joint(problem: Problem, current: Fit, h: Hypothesis, result: Fit) -> bool:
+    """Whether a candidate leaves no more than noise of a clear discrepancy at its own joint: what is left has another cause.
+
+    Along the measured motion of the motors most effects reach the torque of their own joint alone.
+    """
+    j = h.joint
+    if h.decoy or h.on_chain or current.costs[j] <= FAINT * current.counts[j]:
+        return False
+    own = under_own_noise(problem, result)
+    return own is not None and bool(own.costs[j] <= DETECTION_EXCESS * own.counts[j])
+
+
+def beside_unclear(
+    problem: Problem, current: Fit, found: Round, hypotheses: Sequence[Hypothesis], workers: Workers, bare: float
+) -> Round:
+    """A round in which nothing answers, with candidates of which a linear step has shown too little to try them.
+
+    Args:
+        bare: as of ``search.explore``.
+    """
+    direct, scores = explore(problem, current, hypotheses, 0.0, bare, workers)
+    hopefuls = [(h, r) for h, r in direct if not last_is_pointless(r)][:FINALISTS]
+    same = workers.map(lambda x: refit(problem, x[1].model, found.before.weights, x[1].remainders), hopefuls)
+    known = [(c.hypothesis, c.fit) for c in found.candidates]
+    new = [(h, r) for (h, _), r in zip(hopefuls, same, strict=True) if r is not None and all(h is not k for k, _ in known)]
+    if not new:
+        return found
+    before, ranked = under_noise_of_best(problem, found.before, sorted(known + new, key=lambda x: x[1].cost), workers)
+    return weighed_round(before, ranked, scores, {})
+
+
+def temper_of(before: Fit) -> float:
+    """What differences of evidence are divided by, from the model without any of the candidates."""
+    return TEMPER_OF_NOISE if settled(before) else TEMPER
+
+
+def weighed_round(
+    before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]], scores: Sequence[Score], softly: Mapping[tuple[str, str], float]
+) -> Round:
+    """Candidates weighed by their evidence.
+
+    Args:
+        softly: what hypotheses explain under softened weights, by ``key``.
+    """
+    if not ranked:
+        return Round(before, (), tuple(scores), 1.0, 0.0)
+    rivals, excess = rivals_of_best(before, ranked)
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess, temper_of(before))
+    scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
+    noise = DETECTION_EXCESS if before.chi2_per_dof <= DETECTION_EXCESS else 1.0
+    share = max(explained(before, weighed[0].fit, noise), softly.get(weighed[0].hypothesis.key, 0.0))
+    return Round(before, tuple(weighed), tuple(scores), scale, min(share, 1.0))

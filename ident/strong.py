@@ -1,0 +1,224 @@
+"""Strong effects, sought from the starting guesses of the drives, and laws of the gear along the record against those that are predicted whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ident.baseline import DETECTION_EXCESS, astray, begun_again, implausible
+from ident.costs import joint_costs, noise_costs
+from ident.evidence import last_is_pointless
+from ident.extended import Model, along_record, as_loop, is_along_record
+from ident.hypotheses import Hypothesis
+from ident.parallel import Workers
+from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
+from ident.refits import (
+    FINALISTS,
+    FIRST_STEPS,
+    RECORD_EXCESS,
+    either_turn,
+    extended_by,
+    left_by,
+    refit,
+    revived,
+    settled,
+    under_own_noise,
+)
+from ident.screening import Score, signal_scale
+from ident.search import under_noise_of_best
+from ident.torque_fit import ANNEALING, Fit, anneal, fit
+
+STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
+RECOVERIES = 2  # at most, of gears gone astray beside one
+RENEWALS = 3  # at most, of the noise of a law along the record under which its size is found
+STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit ends: the winner is fitted to the end
+OTHER_MOTION = 10.0  # chi2 of a loop over that along the record, each in its own noise, from which it is in another motion
+CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
+SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
+
+
+def beside_strong(
+    problem: Problem,
+    before: Fit,
+    ranked: Sequence[tuple[Hypothesis, Fit]],
+    scores: Sequence[Score],
+    workers: Workers,
+    quiet: frozenset[int] = frozenset(),
+) -> tuple[Fit, list[tuple[Hypothesis, Fit]]]:
+    """Candidates, and the model without them, beside strong effects where one of those does better.
+
+    A strong effect that is missing moves the drives to where none of its steps leads back, and with
+    them the noise that the model passes on: a joint that sticks looks like one without motor inertia.
+    Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
+    gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
+    as loops where these do as well. Those at the joint of the best candidate come first, and last where its own law leaves
+    noise alone.
+
+    Args:
+        quiet: joints at which none is sought.
+    """
+
+    def annealed(score: Score) -> Fit | None:
+        start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+                last = recovered(problem, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP))
+                return either_turn(problem, last, last.model.effects[-1])
+        except NOT_COMPUTED:
+            return None
+
+    top = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
+    likely, key = (top.joint, top.key) if top else (-1, None)
+    chosen = strong_effects(problem, before, scores, likely, quiet)
+    chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
+    pairs: list[tuple[Hypothesis, Fit]] = []
+    for here in (True, False):
+        some = [s for s in chosen if (s.hypothesis.joint == likely) == here]
+        fits = workers.map_in_time(annealed, some, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+        pairs += [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not last_is_pointless(r)]
+        if any(h.key == key and settled(r) for h, r in pairs):
+            break
+    strong = [(h, r) for h, r in pairs if not is_along_record(h)]
+    along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1], [x[0].joint])), key=lambda x: x[1].cost)
+    again = workers.map(lambda x: under_its_noise(problem, x[1]), along[:FINALISTS])
+    along = [(h, r) for (h, _), r in zip(along[:FINALISTS], again, strict=True)]
+    told = workers.map(lambda x: simulated(problem, *x), along)
+    right = [r for (_, r), (h, _) in zip(along, told, strict=True) if not is_along_record(h)]
+    strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(problem, h.joint, r, right))]
+    if any(is_along_record(h) for h, _ in strong):
+        own = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
+        whole = [r for r in own if r is not None]
+        strong = [(h, r) for h, r in strong if not (is_along_record(h) and matched(problem, h.joint, r, whole))]
+    if not left_by(strong) < left_by(ranked):
+        return before, list(ranked)
+    best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
+    for h, r in sorted(strong, key=lambda x: x[1].cost):
+        best.setdefault(h.key, (h, r))
+    others = [(h, r) for h, r in ranked if h.key not in best]
+    return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+
+
+def under_its_noise(problem: Problem, result: Fit) -> Fit:
+    """A fit along the record, of a law at joints where much is left, under the noise that it sees where it ends, once and again.
+
+    That noise is of the size of the law, and the size is found under it.
+    """
+    j = result.model.effects[-1].hypothesis.joint
+    for _ in range(RENEWALS):
+        if result.costs[j] <= RECORD_EXCESS * result.counts[j]:
+            return result
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+                other = fit(problem, revived(problem, result.model), iterations=STRONG_STEPS, remainders=result.remainders)
+        except NOT_COMPUTED:
+            return result
+        if not other.costs[j] < result.costs[j]:
+            return result
+        result = other
+    return result
+
+
+def recovered(problem: Problem, result: Fit) -> Fit:
+    """A fit of a strong effect, gears that have gone astray on the way begun again from their guesses as long as that does better.
+
+    Where an effect is not yet of its size they take up what it leaves, and do not come back.
+    """
+    for _ in range(RECOVERIES):
+        lost = astray(problem, result)
+        if result.chi2_per_dof <= DETECTION_EXCESS or not np.any(lost):
+            return result
+        model = replace(result.model, par=begun_again(problem, result.model.par, lost))
+        other = anneal(problem, model, ladder=ANNEALING[-2:], iterations=STRONG_STEPS, gap=STRONG_GAP, remainders=result.remainders)
+        if not other.cost < CLEARLY_BETTER * result.cost:
+            return result
+        result = other
+    return result
+
+
+def strong_effects(
+    problem: Problem, stage: Fit, scores: Sequence[Score], likely: int, quiet: frozenset[int] = frozenset()
+) -> list[Score]:
+    """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
+
+    None at joints that are ``quiet``: where most of it is at one of these, the next joint takes its place if it has ``SPILT`` of that.
+
+    A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
+    of the time hardly shows its inertia: the linear step of a score says little about either. Motions below the
+    resonances hardly show the gears.
+    """
+    preds = predictions(problem, stage.model, stage.remainders)
+    excess = stage.costs - stage.counts
+    loud = set(np.flatnonzero(excess >= SPILT * excess.max()).tolist()) - quiet
+    loudest = max(loud, key=lambda j: stage.costs[j], default=-1)
+    scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} - quiet if j >= 0}
+    return [
+        replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))
+        for s in scores
+        if s.hypothesis.joint in scales
+        and "size" in s.hypothesis.options
+        and not (problem.motions_alone and s.hypothesis.channel == "spring")
+    ]
+
+
+def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> bool:
+    """Whether a model that is predicted whole leaves noise at a joint, or about what one along the record leaves.
+
+    Noise along the record is taken large for all joints, which flatters the model that it is taken for, most of all where
+    another cause is missing. Both are seen in that noise, each less what its own noise is in those units; not where the whole one is
+    far off in its own: much is within noise that is large enough, and its law along the record is compared in ``outdone_along``.
+
+    Args:
+        whole: fits of models that are predicted whole, each under the noise that it sees itself.
+    """
+    if not whole:
+        return False
+    best = min(whole, key=lambda r: r.costs[joint])
+    if best.costs[joint] <= DETECTION_EXCESS * best.counts[joint]:
+        return True
+    if best.costs[joint] > OTHER_MOTION * max(along.costs[joint], along.counts[joint]):
+        return False
+    left = max(along.costs[joint] - along.counts[joint], 0.0)
+    return bool(left >= CLEARLY_BETTER * excess_under(problem, joint, best, along.weights))
+
+
+def excess_under(problem: Problem, joint: int, result: Fit, weights: Weights) -> float:
+    """Cost of a fit at a joint under other weights, less what its own noise is in those units."""
+    costs = joint_costs(problem, predictions(problem, result.model, result.remainders), weights)
+    return float(costs[joint] - noise_costs(problem, result.weights, weights)[joint])
+
+
+def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]) -> bool:
+    """Whether a model along the record leaves no less at a joint than one along it whose law is right as a loop too.
+
+    What the record tells both of them is no merit of a law that is right along it alone. Both are seen in the noise of the
+    former, each less what its own noise is in those units, as in ``matched``. One that leaves clearly more in its own noise
+    is not right: a hardening gear that rattles makes so much of the noise that anything is within it.
+
+    Args:
+        right: fits along the record of models with such laws.
+    """
+    left = max(along.costs[joint] - along.counts[joint], 0.0)
+    others = [r for r in right if r.model.effects[-1].hypothesis.joint == joint and r.costs[joint] <= along.costs[joint] / CLEARLY_BETTER]
+    return any(excess_under(problem, joint, r, along.weights) <= left for r in others)
+
+
+def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:
+    """A law of the gear that was fitted along the record, as the loop that it is where that leaves noise, or no more than along the record.
+
+    It does not where the arm rattles, and has several steady motions: then the loop is far off in its own noise, however large that
+    along the record. Both are seen in the latter, each less what its own noise is in those units, as in ``matched``.
+    """
+    loop = as_loop(h)
+    *others, last = result.model.effects
+    model = replace(result.model, effects=(*others, replace(last, hypothesis=loop)))
+    other = refit(problem, model, result.weights, result.remainders, FIRST_STEPS)
+    # At the joint itself: another cause may be elsewhere.
+    j = h.joint
+    own = None if other is None else under_own_noise(problem, other)
+    if own is None or own.costs[j] > OTHER_MOTION * max(result.costs[j], result.counts[j]):
+        return h, result
+    left = max(result.costs[j] - result.counts[j], (DETECTION_EXCESS - 1.0) * result.counts[j])
+    return (h, result) if excess_under(problem, j, own, result.weights) > left else (loop, other)
