@@ -87,7 +87,7 @@ def renamed(rounds: Sequence[Round], before: Sequence[Effect], after: Sequence[E
     def of(found: Round) -> Round:
         first, *others = found.candidates
         h = new.get(first.hypothesis.key, first.hypothesis)
-        return replace(found, candidates=(replace(first, hypothesis=h), *(c for c in others if c.hypothesis.key != h.key)))
+        return replace(found, candidates=(replace(first, hypothesis=h), *others))
 
     return [of(r) for r in rounds]
 

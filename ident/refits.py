@@ -75,12 +75,12 @@ def left_by(found: Sequence[tuple[Hypothesis, Fit]], joints: np.ndarray | slice 
 def refit(
     problem: Problem,
     model: Model,
-    weights: Weights,
+    weights: Weights | None,
     remainders: Sequence[np.ndarray],
     iterations: int = 10,
     most: float = np.inf,
 ) -> Fit | None:
-    """A candidate fitted from where screening put it.
+    """A candidate fitted from where screening put it; under the noise that it sees at the start where ``weights`` are None.
 
     None where its model cannot be computed, costs more than ``most`` at the start, or ends where the data feel no change
     of its last effect, if it has any.

@@ -23,13 +23,12 @@ from ident.refits import (
     extended_by,
     left_by,
     refit,
-    revived,
     settled,
     under_own_noise,
 )
 from ident.screening import Score, signal_scale
 from ident.search import under_noise_of_best
-from ident.torque_fit import ANNEALING, Fit, anneal, fit
+from ident.torque_fit import ANNEALING, Fit, anneal
 
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
 RECOVERIES = 2  # at most, of gears gone astray beside one
@@ -110,12 +109,8 @@ def under_its_noise(problem: Problem, result: Fit) -> Fit:
     for _ in range(RENEWALS):
         if result.costs[j] <= RECORD_EXCESS * result.counts[j]:
             return result
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                other = fit(problem, revived(problem, result.model), iterations=STRONG_STEPS, remainders=result.remainders)
-        except NOT_COMPUTED:
-            return result
-        if not other.costs[j] < result.costs[j]:
+        other = refit(problem, result.model, None, result.remainders, STRONG_STEPS)
+        if other is None or not other.costs[j] < result.costs[j]:
             return result
         result = other
     return result
@@ -178,10 +173,15 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
     best = min(whole, key=lambda r: r.costs[joint])
     if best.costs[joint] <= DETECTION_EXCESS * best.counts[joint]:
         return True
-    if best.costs[joint] > OTHER_MOTION * max(along.costs[joint], along.counts[joint]):
+    if in_another_motion(joint, best, along):
         return False
     left = max(along.costs[joint] - along.counts[joint], 0.0)
     return bool(left >= CLEARLY_BETTER * excess_under(problem, joint, best, along.weights))
+
+
+def in_another_motion(joint: int, whole: Fit, along: Fit) -> bool:
+    """Whether a model that is predicted whole is far off at a joint beside one along the record, each in its own noise."""
+    return bool(whole.costs[joint] > OTHER_MOTION * max(along.costs[joint], along.counts[joint]))
 
 
 def excess_under(problem: Problem, joint: int, result: Fit, weights: Weights) -> float:
@@ -218,7 +218,7 @@ def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis,
     # At the joint itself: another cause may be elsewhere.
     j = h.joint
     own = None if other is None else under_own_noise(problem, other)
-    if own is None or own.costs[j] > OTHER_MOTION * max(result.costs[j], result.counts[j]):
+    if own is None or in_another_motion(j, own, result):
         return h, result
     left = max(result.costs[j] - result.counts[j], (DETECTION_EXCESS - 1.0) * result.counts[j])
     return (h, result) if excess_under(problem, j, own, result.weights) > left else (loop, other)

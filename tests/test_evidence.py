@@ -26,7 +26,7 @@ from ident.inverse import REMAINDER_STEPS, STALL_STEPS, stalled
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
 from ident.problem import Weights, data_counts, predictions
-from ident.pruning import pruned, without_shadows
+from ident.pruning import pruned, renamed, without_shadows
 from ident.refits import polish, refit, reweighted, settled, turned, under_own_noise
 from ident.reporting import frf_views
 from ident.rounds import Round, leaves_much, left_share, outdone, settles_its_joint, shadows, with_name
@@ -697,6 +697,20 @@ def test_a_search_tries_other_bodies_where_one_answers_best(ur10, named, tmp_pat
     bodies, told = [h for h in named.values() if "body" in h.options], []
     explore(setup.problem, result, bodies, 0.0, np.inf, Workers(progress=told.append))
     assert sum("refit: link_inertia" in text for text in told) > PER_EFFECT
+
+
+def test_a_round_that_is_renamed_loses_no_probability(named):
+    """The special case takes the place of its law, beside itself as a rival and beside a law tried with two shapes."""
+    dip, rub = (named[effect, "elbow_joint"] for effect in ("stribeck_friction", "coulomb_friction"))
+    late = named["torque_delay", "wrist_1_joint"]
+    rounds = [
+        Round(None, tuple(Candidate(h, None, 0.0, p) for h, p in zip(laws, (0.6, 0.3, 0.1), strict=True)), (), 1.0, 1.0)
+        for laws in ((dip, rub, late), (late, late, rub))
+    ]
+    before, after = ([SimpleNamespace(hypothesis=h) for h in (x, late)] for x in (dip, rub))
+    again = renamed(rounds, before, after)
+    assert [[c.hypothesis for c in r.candidates] for r in again] == [[rub, rub, late], [late, late, rub]]
+    assert [[c.probability for c in r.candidates] for r in again] == [[0.6, 0.3, 0.1]] * 2
 
 
 def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -15,14 +16,19 @@ ROOT = Path(__file__).parent.parent
 SIM_MAY = {"ident.dataset", "ident.excitation"}
 
 
-def imports(path: Path) -> set[str]:
-    out = set()
+def statements(path: Path) -> list[tuple[str, tuple[str, ...]]]:
+    """Modules that a file imports from, and the names it takes from each; none of a plain import."""
+    out = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            out |= {a.name for a in node.names}
+            out += [(a.name, ()) for a in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            out.add(node.module)
+            out.append((node.module, tuple(a.name for a in node.names)))
     return out
+
+
+def imports(path: Path) -> set[str]:
+    return {module for module, _ in statements(path)}
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("ident/**/*.py")), ids=str)
@@ -48,14 +54,8 @@ def arrows() -> dict[str, set[str]]:
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in ROOT.glob("ident/**/*.py")}
     out = {}
     for name, path in modules.items():
-        found = set()
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                found |= {a.name for a in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                within = {f"{node.module}.{a.name}" for a in node.names} & set(modules)
-                found |= within or {node.module}
-        out[name] = (found & set(modules)) - {name}
+        found = [({f"{module}.{x}" for x in names} & set(modules)) or {module} for module, names in statements(path)]
+        out[name] = (set().union(*found) & set(modules)) - {name}
     return out
 
 
@@ -76,9 +76,23 @@ def test_no_module_of_ident_hangs_on_itself():
 )
 def test_lower_layers_know_nothing_of_higher_ones(below, above):
     graph, known = arrows(), set(below)
+    assert below | above <= set(graph)
     while more := set().union(*(graph[m] for m in known)) - known:
         known |= more
     assert not {m for m in known for a in above if m == a or m.startswith(f"{a}.")}
+
+
+def test_every_module_stands_in_a_table_and_imports_none_of_a_later_one():
+    text = (ROOT / "ARCHITECTURE.md").read_text().split("## Import rules")[0]
+    tables = text.split("| module | content |")[1:]
+    rows = [(i, row.split("|")[1]) for i, table in enumerate(tables) for row in table.splitlines() if row.startswith("| `")]
+    place = {f"ident.{name.rstrip('/')}": i for i, cell in rows for name in re.findall(r"`([\w/]+)`", cell)}
+
+    def at(module: str) -> int:
+        return place[".".join(module.split(".")[:2])]
+
+    graph = {m: found - {"ident"} for m, found in arrows().items() if m != "ident"}
+    assert not [(m, x) for m, found in graph.items() for x in found if at(x) > at(m)]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)
