@@ -15,9 +15,10 @@ import numpy as np
 from ident.candidates import draw_candidates
 from ident.chain import build_structure
 from ident.design import CRITERIA, LEAST, RANDOM, criterion_loss, optimal_weights, random_losses, round_weights
-from ident.excitation import make_plan, operating_points
+from ident.excitation import operating_points
 from ident.graybox import Parameters, parameter_names
 from ident.information import conditions, information, linearised
+from ident.plan import make_plan
 from robot_assets.robot import load_robot
 
 POINTS = 15

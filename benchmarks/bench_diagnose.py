@@ -8,7 +8,8 @@ import time
 import numpy as np
 
 from ident.diagnosis import diagnose_fully
-from ident.excitation import make_plan, operating_points
+from ident.excitation import operating_points
+from ident.plan import make_plan
 from robot_assets.robot import load_robot
 from sim import parse_effect, run_experiment
 from sim.plant import build_plant, link_inertia_diagonal

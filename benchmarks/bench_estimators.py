@@ -16,12 +16,13 @@ import numpy as np
 
 from ident.chain import Structure, build_structure
 from ident.estimate import ESTIMATORS, fit_frf
-from ident.excitation import LOOP_HZ, Excitation, make_plan, operating_points
+from ident.excitation import LOOP_HZ, Excitation, operating_points
 from ident.frf import Blocks, average, estimate_frf
 from ident.frf_basis import FRF
 from ident.graybox import Parameters, impedance, parameter_names, sampled_frf
 from ident.identification import identify
 from ident.information import LOOP_DAMPING, Conditions, conditions, linearised
+from ident.plan import make_plan
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import draw_drives

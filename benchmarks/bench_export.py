@@ -16,10 +16,10 @@ import numpy as np
 from ident.conclude import baseline_values, reported_parameters
 from ident.dataset import Dataset
 from ident.excitation import operating_points
-from ident.extended import Effect, Model, along_record
 from ident.gain import measure_gain, segment_errors
 from ident.hypotheses import Hypothesis, catalogue
 from ident.identification import identify
+from ident.model import Effect, Model, along_record
 from ident.problem import Problem
 from ident.show.export import NATIVE, build_mjcf, note_record
 from ident.show.simulated_gain import export_baseline, simulated_errors, spread

@@ -15,9 +15,10 @@ import numpy as np
 
 from ident.chain import build_structure
 from ident.estimate import fit_frf
-from ident.excitation import make_plan, operating_points
+from ident.excitation import operating_points
 from ident.frf import estimate_frf
 from ident.graybox import Parameters
+from ident.plan import make_plan
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import draw_drives

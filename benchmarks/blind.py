@@ -35,8 +35,9 @@ from sizing import brought_to, distortion, noise_power, spectra
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnosis import diagnose_fully
-from ident.excitation import Experiment, Plan, operating_points
+from ident.excitation import operating_points
 from ident.parallel import open_executor
+from ident.plan import Experiment, Plan
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, load_robot
 from sim import draw_effect, run_experiment

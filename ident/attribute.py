@@ -18,9 +18,9 @@ import numpy as np
 from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, implausible
 from ident.contests import weighed_again
 from ident.evidence import Candidate, last_is_pointless
-from ident.extended import Effect, is_along_record
 from ident.faint import SEEN, hidden
 from ident.hypotheses import Hypothesis, catalogue
+from ident.model import Effect, is_along_record
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
 from ident.pruning import plainer, plainly_special, pruned, renamed, without_shadows

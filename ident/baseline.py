@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import scipy.stats
 
-from ident.extended import Effect, Model
 from ident.graybox import Parameters
+from ident.model import Effect, Model
 from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
 

@@ -113,7 +113,7 @@ def experiment(
     import numpy as np
 
     from ident.dataset_io import save_dataset
-    from ident.excitation import plan_from_toml
+    from ident.plan_file import plan_from_toml
     from sim import parse_effect, run_experiment
     from sim.experiment import draw_drives
 

@@ -11,9 +11,10 @@ from ident.baseline import DETECTION_EXCESS, UNDETERMINED
 from ident.chain import INERTIAL, Structure
 from ident.dataset import Dataset
 from ident.evidence import Candidate, pointless
-from ident.extended import Effect, Prediction, is_along_record
+from ident.extended import Prediction
 from ident.hypotheses import Hypothesis
 from ident.link_sensor import LinkDelay
+from ident.model import Effect, is_along_record
 from ident.next_experiment import NextExperiment, advice
 from ident.noise import drifting
 from ident.problem import Problem

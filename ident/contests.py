@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ident.evidence import Candidate, model_error, weigh
-from ident.extended import Effect
 from ident.hypotheses import Hypothesis, catalogue
+from ident.model import Effect
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
 from ident.pruning import pruned

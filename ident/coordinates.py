@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.extended import Effect, Model, is_along_record
 from ident.graybox import parameter_names
+from ident.model import Effect, Model, is_along_record
 from ident.problem import Problem
 
 PRIOR_LOG_STD = 1.5  # of a baseline parameter about its starting guess, natural logarithm

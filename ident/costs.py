@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ident.errors_in_variables import scatter_costs
-from ident.extended import Model, Prediction, joints_along_record
+from ident.extended import Prediction
 from ident.group import Group
+from ident.model import Model, joints_along_record
 from ident.noise import residual_covariance
 from ident.output_noise import noise_of_laws
 from ident.parallel import map_threads

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.excitation import Experiment, Part, Plan, Schedule, Trajectory, point_to_point
+from ident.plan import Experiment, Part, Plan, Schedule, Trajectory, point_to_point
 from robot_assets.errors import DataError
 
 SETTLE = 1.0  # s of rest after a move; the transient periods of the first experiment follow it

@@ -11,12 +11,15 @@ import numpy as np
 from ident.columns import Columns, Products
 from ident.coordinates import coordinate_names, effect_steps, moves_links, pack, shifts_posture, unpack
 from ident.errors_in_variables import impedance_slopes, scatter_information, scatter_slope
-from ident.extended import Effect, Model, Prediction, beside, joints_along_record, predict, predict_at, through_drives
+from ident.extended import Prediction, predict, predict_at, through_drives
 from ident.group import Group
-from ident.inverse import Motion, baseline_products
+from ident.inverse import baseline_products
+from ident.model import Effect, Model, joints_along_record
+from ident.motion import Motion
 from ident.parallel import map_threads
 from ident.posture import moved_by_posture
 from ident.problem import Problem, Weights, compared_lines, output_error
+from ident.reactions import beside
 from ident.stiction import as_free, held
 
 TIMING_STEP = 1e-6  # s, for differences

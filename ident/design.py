@@ -24,9 +24,9 @@ import scipy.optimize
 
 from ident.candidates import Candidates, draw_candidates
 from ident.chain import Structure, build_structure
-from ident.excitation import Plan, make_plan
 from ident.graybox import Parameters, parameter_names
 from ident.information import conditions, information, linearised, motor_loads
+from ident.plan import Plan, make_plan
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 

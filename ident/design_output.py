@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ident.design import LEAST, Design, design_experiment, design_plan
-from ident.excitation import Plan, plan_to_toml
+from ident.plan import Plan
+from ident.plan_file import plan_to_toml
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 

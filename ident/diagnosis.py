@@ -14,13 +14,14 @@ from ident.baseline import fit_baseline
 from ident.chain import build_structure
 from ident.conclude import conclude, named_effects
 from ident.dataset import Dataset
-from ident.extended import Effect, Prediction, predict
+from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import Parameters
 from ident.group import Group
 from ident.hypotheses.sensing import torque_offset
 from ident.identification import RUNAWAY, Setup, identify, set_up, with_held_out
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
+from ident.model import Effect
 from ident.next_experiment import separating_experiment
 from ident.parallel import Workers, one_thread_each
 from ident.period_checks import unrepeated
@@ -34,7 +35,7 @@ from ident.units import torque_unit
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 
 LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
-SETTLED_BY_INERTIAS = 0.7  # chi2 per degree of freedom with the links' inertias found, over that without, that is worth them
+SETTLED_BY_INERTIAS = 0.7  # chi2 with the links' inertias found, over that without, that is worth them; geometric mean over joints
 CARRIED_OVER = 0.9  # squares of the torque left with inertias found, over those with inertias described, on parts left out, that are worth them
 MAX_SECONDS = 600.0  # of search for causes
 SEED = 0
@@ -257,9 +258,15 @@ def with_inertias(
     except NOT_COMPUTED:
         return setup, result, None
     other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
-    if other.final.chi2_per_dof > SETTLED_BY_INERTIAS * result.final.chi2_per_dof:
+    if left_over(other.final, result.final) > SETTLED_BY_INERTIAS:
         return setup, result, None
     return replace(setup, problem=problem), other, rigid
+
+
+def left_over(one: Fit, other: Fit) -> float:
+    """What a fit leaves, over what another leaves: geometric mean over the joints, at each of them no less than noise."""
+    logs = [np.log(np.maximum(fit.costs / fit.counts, 1.0)) for fit in (one, other)]
+    return float(np.exp(np.mean(logs[0] - logs[1])))
 
 
 def leave_one_out(

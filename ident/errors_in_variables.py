@@ -15,9 +15,10 @@ from dataclasses import replace
 import numpy as np
 
 from ident.columns import Products
-from ident.extended import Effect, Model, Prediction
+from ident.extended import Prediction
 from ident.group import Group
 from ident.inverse import Sampling, make_plane
+from ident.model import Effect, Model
 from ident.stiction import as_held
 
 MOST = 0.9  # of the information on any direction of the coordinates, that may be taken off as noise

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.stats
 
 from ident.baseline import DETECTION_EXCESS
-from ident.extended import Effect
 from ident.hypotheses import Hypothesis, Parameter
+from ident.model import Effect
 from ident.torque_fit import Fit, inverse
 
 ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent

@@ -14,8 +14,8 @@ import numpy as np
 import scipy.stats
 
 from ident.baseline import DETECTION_EXCESS
-from ident.extended import has_rough_law, is_along_record
 from ident.hypotheses import Hypothesis
+from ident.model import has_rough_law, is_along_record
 from ident.noise import drifting
 from ident.problem import Problem, predictions
 from ident.screening import Score, screen

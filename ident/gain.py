@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.extended import Model, Prediction, predict
+from ident.extended import Prediction, predict
 from ident.group import Group
+from ident.model import Model
 from ident.output_noise import noise_covariance
 from ident.problem import Problem
 from ident.stiction import as_held, held_share

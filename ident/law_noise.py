@@ -7,19 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.extended import (
-    Effect,
-    Prediction,
-    has_loop,
-    joints_along_record,
-    motion_per_position,
-    noise_of_motion,
-    predict_at,
-    simulated_laws,
-)
+from ident.extended import Prediction, predict_at
 from ident.group import NOISE_LINES, Group, mean_over_lines, signal_share
 from ident.hypotheses import kernels
-from ident.inverse import Solution
+from ident.model import Effect, has_loop, joints_along_record, simulated_laws
+from ident.motion import Solution
+from ident.reactions import motion_per_position, noise_of_motion
 
 NOISE_DRAWS = 4  # of the noise that laws of the gear answer to
 JUMP = 4.0  # power of what noise makes of a law, over that along the motion as it is, beyond which the arm jumps

@@ -17,12 +17,13 @@ import numpy as np
 from ident.attribute import Attribution
 from ident.derivatives import jacobian
 from ident.evidence import Candidate
-from ident.excitation import Plan, make_plan
-from ident.extended import predict, simulated_laws
+from ident.extended import predict
 from ident.graybox import Parameters, equilibrium, linearise
 from ident.group import Group
 from ident.information import motor_loads
+from ident.model import simulated_laws
 from ident.parallel import map_threads
+from ident.plan import Plan, make_plan
 from ident.problem import Problem
 from ident.torque_fit import Fit
 from ident.verdict import Cause

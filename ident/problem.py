@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.chain import Structure
-from ident.extended import Model, Prediction, predict
+from ident.extended import Prediction, predict
 from ident.graybox import Parameters
 from ident.group import Group
-from ident.inverse import Sampling, Torques
+from ident.inverse import Sampling
+from ident.model import Model
+from ident.motion import Torques
 from ident.parallel import map_threads
 
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution

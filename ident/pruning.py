@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from ident.evidence import ABSENT, WAVE, is_wave, pointless
-from ident.extended import Effect, Model, joints_along_record
 from ident.group import Group
 from ident.hypotheses import Hypothesis
+from ident.model import Effect, Model, joints_along_record
 from ident.parallel import Workers
 from ident.problem import Problem
 from ident.refits import POLISH_STEPS, clip_to_bounds, polish, refit, reweighted

@@ -9,9 +9,9 @@ import numpy as np
 
 from ident.baseline import DETECTION_EXCESS
 from ident.costs import fair_costs
-from ident.extended import Effect, Model, is_along_record, is_dry
 from ident.hypotheses import Hypothesis
 from ident.hypotheses.friction import SMOOTHING, other_turn
+from ident.model import Effect, Model, is_along_record, is_dry
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
 from ident.screening import Score
 from ident.torque_fit import Fit, fit

@@ -9,9 +9,10 @@ import numpy as np
 import scipy.fft
 
 from ident.dataset import Dataset, Segment
-from ident.extended import Effect, Model, Prediction, predict
+from ident.extended import Prediction, predict
 from ident.frf import estimate_frf
 from ident.group import Group
+from ident.model import Effect, Model
 from ident.output_noise import noise_covariance
 from ident.problem import Problem, output_error, residual
 from ident.torque_fit import Fit
@@ -163,14 +164,11 @@ def evidence_plot(
     """
     h = effect.hypothesis
     rest = Model(fit.model.structure, fit.model.par, tuple(e for e in fit.model.effects if e is not effect))
-    j, n = max(h.joint, 0), problem.structure.n
+    bare = [predict(rest, group, problem.sampling) for group in problem.groups]
+    j, n = h.joint if h.joint >= 0 else most_affected(problem, bare), problem.structure.n
     by_link = h.channel == "spring" and all(j in group.links for group in problem.groups)
     xs, ys, ms = [], [], []
-    for group, pred in zip(problem.groups, predictions, strict=True):
-        without = predict(rest, group, problem.sampling)
-        if h.joint < 0:
-            power = np.sum(np.abs(group.U - without.U) ** 2, axis=(0, 1))
-            j = int(np.argmax(power / np.maximum(np.sum(np.abs(group.U[:, 1:]) ** 2, axis=(0, 1)), 1e-300)))
+    for group, pred, without in zip(problem.groups, predictions, bare, strict=True):
         motion = pred.motion(group)
         band = slice(group.n_compared, None)
         curves = []
@@ -202,6 +200,14 @@ def evidence_plot(
     shown = f"link encoder of {joint} beside the model, rad" if by_link else f"residual torque of {joint}, N m"
     title = f"{h.effect.replace('_', ' ')} at {h.place}"
     return EvidencePlot(cause, title, text_at(label, linear), text_at(shown, linear), x, y, x[order], m[order])
+
+
+def most_affected(problem: Problem, bare: Sequence[Prediction]) -> int:
+    """The joint at which predictions are furthest off, over the torque that moves it, all postures together."""
+    pairs = list(zip(problem.groups, bare, strict=True))
+    off = sum(np.sum(np.abs(group.U - pred.U) ** 2, axis=(0, 1)) for group, pred in pairs)
+    moving = sum(np.sum(np.abs(group.U[:, 1:]) ** 2, axis=(0, 1)) for group, _ in pairs)
+    return int(np.argmax(off / np.maximum(moving, 1e-300)))
 
 
 def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> str:

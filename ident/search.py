@@ -15,8 +15,9 @@ from ident.baseline import DETECTION_EXCESS, HOPELESS
 from ident.coordinates import stepped
 from ident.costs import weighted_cost
 from ident.evidence import explained, last_is_pointless
-from ident.extended import Model, Prediction, has_rough_law, is_along_record
+from ident.extended import Prediction
 from ident.hypotheses import Hypothesis
+from ident.model import Model, has_rough_law, is_along_record
 from ident.parallel import Workers
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
 from ident.refits import FAINT, FINALISTS, FIRST_STEPS, either_turn, extended_by, left_by, refit, reweighted, turned

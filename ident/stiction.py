@@ -11,8 +11,10 @@ from dataclasses import replace
 import numpy as np
 import scipy.fft
 
-from ident.extended import Prediction, beside, is_dry
+from ident.extended import Prediction
 from ident.group import Group
+from ident.model import is_dry
+from ident.reactions import beside
 
 PROBE = 1e-6  # of the torque, by which a drive asks for less to see what is held
 LEFT_HELD = 0.3  # of the noise of a motor that is held, that counts: when it is held is not known to the sample

@@ -11,8 +11,8 @@ import numpy as np
 from ident.baseline import DETECTION_EXCESS, astray, begun_again, implausible
 from ident.costs import joint_costs, noise_costs
 from ident.evidence import last_is_pointless
-from ident.extended import Model, along_record, as_loop, is_along_record
 from ident.hypotheses import Hypothesis
+from ident.model import Model, along_record, as_loop, is_along_record
 from ident.parallel import Workers
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
 from ident.refits import (
@@ -175,13 +175,22 @@ def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> b
         return True
     if in_another_motion(joint, best, along):
         return False
-    left = max(along.costs[joint] - along.counts[joint], 0.0)
-    return bool(left >= CLEARLY_BETTER * excess_under(problem, joint, best, along.weights))
+    return bool(left_along(joint, along) >= CLEARLY_BETTER * excess_under(problem, joint, best, along.weights))
 
 
 def in_another_motion(joint: int, whole: Fit, along: Fit) -> bool:
-    """Whether a model that is predicted whole is far off at a joint beside one along the record, each in its own noise."""
+    """Whether a model with a loop in a gear is far off at a joint beside one along the record, each in its own noise.
+
+    Without such a loop there is one steady motion, and a model that is far off is wrong or lacks a cause.
+    """
+    if not any(e.hypothesis.gear_law for e in whole.model.effects):
+        return False
     return bool(whole.costs[joint] > OTHER_MOTION * max(along.costs[joint], along.counts[joint]))
+
+
+def left_along(joint: int, along: Fit) -> float:
+    """Excess of the cost over noise that a fit along the record leaves at a joint, at least what counts as none."""
+    return float(max(along.costs[joint] - along.counts[joint], (DETECTION_EXCESS - 1.0) * along.counts[joint]))
 
 
 def excess_under(problem: Problem, joint: int, result: Fit, weights: Weights) -> float:
@@ -200,7 +209,7 @@ def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]
     Args:
         right: fits along the record of models with such laws.
     """
-    left = max(along.costs[joint] - along.counts[joint], 0.0)
+    left = left_along(joint, along)
     others = [r for r in right if r.model.effects[-1].hypothesis.joint == joint and r.costs[joint] <= along.costs[joint] / CLEARLY_BETTER]
     return any(excess_under(problem, joint, r, along.weights) <= left for r in others)
 
@@ -220,5 +229,4 @@ def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis,
     own = None if other is None else under_own_noise(problem, other)
     if own is None or in_another_motion(j, own, result):
         return h, result
-    left = max(result.costs[j] - result.counts[j], (DETECTION_EXCESS - 1.0) * result.counts[j])
-    return (h, result) if excess_under(problem, j, own, result.weights) > left else (loop, other)
+    return (h, result) if excess_under(problem, j, own, result.weights) > left_along(j, result) else (loop, other)

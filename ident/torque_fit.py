@@ -28,8 +28,9 @@ from ident.coordinates import (
 from ident.costs import by_noise, fair_costs, has_scatter, weighted_cost
 from ident.derivatives import jacobians, normal_equations, shared_information, shared_slope
 from ident.errors_in_variables import information_left, trusted_share
-from ident.extended import Model, Prediction, has_loop
+from ident.extended import Prediction
 from ident.inverse import REMAINDER_STEPS
+from ident.model import Model, has_loop
 from ident.problem import Problem, Weights, data_count, data_counts, predictions
 from ident.weights import make_weights
 

@@ -11,10 +11,11 @@ from ident.attribute import Attribution
 from ident.baseline import DETECTION_EXCESS, implausible
 from ident.contests import RIPPLE, SAME_PERIOD
 from ident.costs import fair_costs, weighted_cost
-from ident.extended import Effect, Prediction
+from ident.extended import Prediction
 from ident.faint import SHADOW
 from ident.group import Group
 from ident.hypotheses import Hypothesis
+from ident.model import Effect
 from ident.problem import NOT_COMPUTED, Problem, data_counts, predictions
 from ident.pruning import UNTOLD
 from ident.refits import settled

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ident.excitation import Plan
+from ident.plan import Plan
 from robot_assets.robot import Robot
 
 SCHEMA = "simgap-verdict/1"

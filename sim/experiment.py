@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.excitation import LOOP_HZ, Plan, make_plan
+from ident.excitation import LOOP_HZ
+from ident.plan import Plan, make_plan
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 from sim.loop import Controller, Noise, failed, run_loop

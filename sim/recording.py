@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ident.dataset import Dataset, Segment
-from ident.excitation import Schedule
+from ident.plan import Schedule
 from robot_assets.errors import DataError
 from sim.experiment import as_dataset, check_step, loop_gains, noise_levels
 from sim.loop import Controller, failed, run_loop

@@ -11,10 +11,11 @@ from ident.attribute import as_loops, from_other_motions
 from ident.coordinates import pack, unpack
 from ident.costs import joint_costs
 from ident.derivatives import jacobian
-from ident.extended import Effect, Model, along_record, has_rough_law, is_along_record, joints_along_record, predict
+from ident.extended import predict
 from ident.hypotheses import catalogue, kernels
 from ident.hypotheses.yielding import elastoplastic
 from ident.identification import set_up
+from ident.model import Effect, Model, along_record, has_rough_law, is_along_record, joints_along_record
 from ident.parallel import Workers
 from ident.problem import predictions
 from ident.strong import simulated
@@ -119,7 +120,7 @@ def test_the_deflection_along_a_record_is_found_beside_a_strong_damper(rattling,
     assert group.omega[-1] * par.damping[0] > 2.0 * par.stiffness[0]
     model = replace(model, par=par, effects=(Effect(along_record(backlash), np.array([gap, 0.0])),))
     few = predict(model, group, problem.sampling).outputs(group)[..., 0]
-    monkeypatch.setattr("ident.extended.RECORD_STEPS", 200)
+    monkeypatch.setattr("ident.reactions.RECORD_STEPS", 200)
     many = predict(model, group, problem.sampling).outputs(group)[..., 0]
     assert np.linalg.norm(few - many) < 0.02 * np.linalg.norm(many)
 

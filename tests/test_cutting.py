@@ -15,9 +15,10 @@ from ident.chain import build_structure
 from ident.cutting import SETTLE, cut_recording, schedule_plan, usage
 from ident.dataset_io import load_dataset
 from ident.estimate import fit_frf
-from ident.excitation import SPEED_SHARE, make_plan, point_to_point
+from ident.excitation import SPEED_SHARE
 from ident.frf import estimate_frf
 from ident.graybox import Parameters
+from ident.plan import make_plan, point_to_point
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim import run_experiment

@@ -17,9 +17,10 @@ from ident.design import (
     random_losses,
     round_weights,
 )
-from ident.excitation import LOOP_HZ, Excitation, operating_points, plan_from_toml, plan_to_toml
+from ident.excitation import LOOP_HZ, Excitation, operating_points
 from ident.graybox import Parameters, impedance, sampled_frf
 from ident.information import LOOP_DAMPING, conditions, information, linearised
+from ident.plan_file import plan_from_toml, plan_to_toml
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 

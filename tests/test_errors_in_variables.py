@@ -9,10 +9,11 @@ from ident.coordinates import coordinate_names, pack, unpack
 from ident.costs import by_noise, fair_costs, joint_costs
 from ident.derivatives import shared_information, shared_slope
 from ident.errors_in_variables import MOST, information_left, trusted_share
-from ident.extended import Effect, Model, predict
+from ident.extended import predict
 from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.inverse import REMAINDER_STEPS
+from ident.model import Effect, Model
 from ident.problem import predictions
 from ident.refits import refit
 from ident.torque_fit import fit

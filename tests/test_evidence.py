@@ -16,31 +16,21 @@ from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose, harmful
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
-from ident.extended import Effect, along_record
 from ident.hypotheses import catalogue
+from ident.hypotheses.hinges import hinge_inertia
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
-from ident.hypotheses.structure import hinge_inertia
 from ident.identification import identify
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, stalled
+from ident.model import Effect, along_record
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
 from ident.problem import Weights, data_counts, predictions
 from ident.pruning import pruned, renamed, without_shadows
 from ident.refits import polish, refit, reweighted, settled, turned, under_own_noise
-from ident.reporting import frf_views
+from ident.reporting import frf_views, most_affected
 from ident.rounds import Round, leaves_much, left_share, outdone, settles_its_joint, shadows, with_name
-from ident.screening import (
-    Score,
-    _Field,
-    _gain,
-    _line_sums,
-    _lines,
-    _share_of_gears,
-    _Stage,
-    _whole_sums,
-    screen,
-)
+from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
 from ident.search import PER_EFFECT, STRONG, begin, choose, explore, other_bodies
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
@@ -563,11 +553,14 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     assert wrong.costs[joint] > 2.0 * wrong.counts[joint] > flattered.costs[joint]
     assert matched(problem, joint, flattered, [wrong, result])
     assert not matched(problem, joint, flattered, [wrong]) and not matched(problem, joint, flattered, [])
-    # The same error in noise so large that it hides it is not less of an error, but for one that is far off without.
+    # The same error in noise so large that it hides it is not less of an error, but for a loop that is far off without.
     assert wrong.costs[joint] > 2.0 * OTHER_MOTION * wrong.counts[joint]
+    loop = Effect(named["hardening_stiffness", "elbow_joint"], np.array([1.0]))
+    rattling = replace(wrong, model=replace(rub, effects=(*rub.effects, loop)))
     for share, same in ((0.2, True), (0.01, False)):
         hidden = replace(wrong, weights=loud, costs=wrong.counts + share * (wrong.costs - wrong.counts))
-        assert matched(problem, joint, hidden, [wrong]) is same
+        assert matched(problem, joint, hidden, [wrong])
+        assert matched(problem, joint, hidden, [rattling]) is same
 
 
 def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(identified, named):
@@ -951,3 +944,13 @@ def test_the_cause_between_two_joints_names_both(identified, named):
     assert told.probability == pytest.approx(0.7) and [a.effect for a in told.alternatives] == ["torque_delay"]
     assert cause.joint == "wrist_1_joint" and cause.joints == ("wrist_1_joint", "wrist_2_joint")
     assert "wrist_1_joint turns wrist_2_joint too" in cause.evidence
+
+
+def test_a_cause_of_the_whole_arm_is_shown_at_one_joint():
+    moving = np.ones((2, 5, 3), complex)
+    groups = [SimpleNamespace(U=scale * moving) for scale in (1.0, 2.0)]
+    # Postures differ in the joint that is furthest off; the plot has one axis.
+    off = [np.array([0.0, 3.0, 0.1]), np.array([4.0, 0.0, 0.2])]
+    bare = [SimpleNamespace(U=g.U + x) for g, x in zip(groups, off, strict=True)]
+    assert most_affected(SimpleNamespace(groups=groups), bare) == 0
+    assert most_affected(SimpleNamespace(groups=groups[:1]), bare[:1]) == 1

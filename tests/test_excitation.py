@@ -5,15 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.excitation import (
-    crest_factor,
-    make_plan,
-    odd_random_grid,
-    operating_points,
-    orthogonal_multisines,
-    plan_from_toml,
-    plan_to_toml,
-)
+from ident.excitation import crest_factor, odd_random_grid, operating_points, orthogonal_multisines
+from ident.plan import make_plan
+from ident.plan_file import plan_from_toml, plan_to_toml
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 

@@ -12,9 +12,9 @@ from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.conclude import drift_note
 from ident.diagnosis import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
-from ident.extended import Effect, along_record, as_loop
 from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
 from ident.hypotheses import catalogue
+from ident.model import Effect, along_record, as_loop
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
 from ident.refits import refit
 from ident.rounds import Round, temper_of, told_share, weighed_round

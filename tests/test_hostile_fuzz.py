@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ident.convert import convert_logs
 from ident.convert.guess import guess_map
 from ident.dataset_io import load_dataset, save_dataset
-from ident.excitation import plan_from_toml
+from ident.plan_file import plan_from_toml
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import write_robot
 from tests.hostile import datasets, maps, sound

@@ -12,12 +12,13 @@ from ident.costs import joint_costs
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose
 from ident.estimate import ESTIMATORS, fit_frf
-from ident.extended import Effect, Model, predict
+from ident.extended import predict
 from ident.frf import estimate_frf
 from ident.gain import segment_errors
 from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
 from ident.identification import set_up
+from ident.model import Effect, Model
 from ident.problem import output_error, predictions
 from ident.screening import screen
 from ident.torque_fit import SLIGHT, fit

@@ -100,7 +100,7 @@ def test_whatever_the_moment_the_files_are_of_one_run(tmp_path):
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     """A dataset, a log with its map and robot, and a plan."""
-    from ident.excitation import plan_to_toml
+    from ident.plan_file import plan_to_toml
     from robot_assets.robot import load_robot
     from sim import run_experiment
 

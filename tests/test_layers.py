@@ -13,7 +13,7 @@ import pytest
 import ident
 
 ROOT = Path(__file__).parent.parent
-SIM_MAY = {"ident.dataset", "ident.excitation"}
+SIM_MAY = {"ident.dataset", "ident.excitation", "ident.plan"}
 
 
 def statements(path: Path) -> list[tuple[str, tuple[str, ...]]]:

@@ -8,10 +8,10 @@ import pytest
 from ident.coordinates import pack, unpack
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose, diagnose_fully
-from ident.extended import Effect, Model
 from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.link_sensor import LinkDelay, comparable_links, with_link_encoders
+from ident.model import Effect, Model
 from ident.problem import data_count, data_counts, predictions
 from ident.weights import make_weights
 from sim import run_experiment

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ident import inverse
-from ident.extended import Model, predict
+from ident.extended import predict
 from ident.identification import set_up
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, geometric_remainder, make_plane, solve, true_position
+from ident.model import Model
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from tests.conftest import small_plan, through_files

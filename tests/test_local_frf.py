@@ -7,9 +7,9 @@ import pytest
 import scipy.linalg
 
 from ident.dataset import Dataset, Segment
-from ident.excitation import make_plan
 from ident.frf import estimate_frf
 from ident.local_frf import estimate_local
+from ident.plan import make_plan
 from robot_assets.errors import DataError
 
 RATE = 250.0

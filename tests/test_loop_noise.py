@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.extended import Effect, Model, along_record, predict
+from ident.extended import predict
 from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.law_noise import loop_noise
+from ident.model import Effect, Model, along_record
 from ident.problem import output_error
 from ident.weights import make_weights
 
@@ -68,7 +69,7 @@ def test_a_law_is_shown_the_signal_alone(noisy, monkeypatch):
         return np.linalg.norm(np.mean(answers, axis=0) - wanted)
 
     shown = off()
-    monkeypatch.setattr("ident.extended.signal_share", lambda X, noise: np.ones(X.shape))
+    monkeypatch.setattr("ident.reactions.signal_share", lambda X, noise: np.ones(X.shape))
     assert shown < 0.8 * off()
 
 

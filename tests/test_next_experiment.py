@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from ident.evidence import Candidate
-from ident.excitation import plan_from_toml, plan_to_toml
-from ident.extended import Effect, Model
 from ident.hypotheses import catalogue
+from ident.model import Effect, Model
 from ident.next_experiment import _Option, _separation, advice, moved, separating_experiment
+from ident.plan_file import plan_from_toml, plan_to_toml
 from ident.torque_fit import fit
 
 

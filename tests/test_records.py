@@ -9,11 +9,12 @@ import pytest
 from ident.closing import close_motion
 from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose
-from ident.extended import Effect, Model, predict
+from ident.extended import predict
 from ident.gain import mean_squares, stretch_squares
 from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.law_noise import law_noise
+from ident.model import Effect, Model
 from ident.problem import data_count
 from ident.records import build_groups
 from ident.weights import make_weights

@@ -8,8 +8,9 @@ from ident import simulated_gain
 from ident.dataset_io import load_dataset
 from ident.diagnosis import diagnose_fully
 from ident.excitation import operating_points
-from ident.extended import Model, predict
+from ident.extended import predict
 from ident.identification import set_up
+from ident.model import Model
 from ident.records import build_groups
 from ident.show.export import write_mjcf
 from ident.show.replay import equilibrium, load_arm, replay, sampled_impedance

@@ -11,16 +11,17 @@ from hypothesis import strategies as st
 from ident.chain import LinkChange, build_structure
 from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose_fully
-from ident.extended import Effect, Model, predict
+from ident.extended import predict
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
 from ident.hypotheses.sensing import torque_offset
 from ident.identification import identify, set_up, with_held_out
+from ident.model import Effect, Model
+from ident.position_lines import wave_numbers
 from ident.problem import predictions
 from ident.pruning import plainer
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, carried_over, fit_rigid, regressor
-from ident.screening import wave_numbers
 from ident.torque_fit import fit
 from ident.trust import too_fast
 from robot_assets.robot import Elasticity, load_robot

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from ident.chain import build_structure
-from ident.excitation import make_plan, plan_from_toml
 from ident.graybox import Parameters, equilibrium, linearise, parameter_names
 from ident.hypotheses.structure import Change, apply_change
+from ident.plan import make_plan
+from ident.plan_file import plan_from_toml
 from ident.show.export import build_mjcf
 from ident.show.figures import rounded, trace_figure
 from ident.show.outputs import write_outputs

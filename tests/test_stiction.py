@@ -16,10 +16,11 @@ from ident.costs import fair_costs, joint_costs
 from ident.dataset import Dataset, Segment
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose
-from ident.extended import Effect, Model, along_record, predict
+from ident.extended import predict
 from ident.group import Group
 from ident.hypotheses import catalogue
 from ident.identification import set_up
+from ident.model import Effect, Model, along_record
 from ident.output_noise import noise_covariance
 from ident.problem import data_counts, residual
 from ident.pruning import plainly_special

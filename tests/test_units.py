@@ -4,8 +4,8 @@ import pytest
 
 from ident.chain import build_structure
 from ident.conclude import at_linear_joint
-from ident.extended import Effect
 from ident.hypotheses import catalogue
+from ident.model import Effect
 from ident.units import (
     KIND_UNITS,
     LINEAR_UNITS,

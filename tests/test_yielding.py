@@ -6,10 +6,11 @@ import scipy.integrate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.extended import Effect, Model, predict
+from ident.extended import predict
 from ident.hypotheses import catalogue
 from ident.hypotheses.yielding import SLIP, along_path, bristle, elastoplastic, yielded, yielding_point
 from ident.identification import set_up
+from ident.model import Effect, Model
 from sim import parse_effect, run_experiment
 from tests.conftest import small_plan, through_files
 

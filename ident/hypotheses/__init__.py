@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.chain import Structure
-from ident.hypotheses import drive, friction, sensing, structure, transmission
+from ident.hypotheses import bodies, drive, friction, hinges, link_springs, sensing, structure, transmission
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 
 LEAST_DAMPING = 1e-6  # s, of a gear, over its stiffness
@@ -24,8 +24,8 @@ PER_JOINT = (
     transmission.softening_stiffness,
     transmission.hysteresis,
     transmission.transmission_error,
-    structure.gravity_spring,
-    structure.dress_pack,
+    link_springs.gravity_spring,
+    link_springs.dress_pack,
     sensing.encoder_eccentricity,
     sensing.sensor_delay,
     sensing.sensor_lag,
@@ -47,7 +47,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     for j, name in enumerate(names):
         out += [make(j, name) for make in PER_JOINT]
         out.append(transmission.backlash(j, name, max(robot.joints[j].damping / robot.joints[j].stiffness, LEAST_DAMPING)))
-        out.append(structure.dress_pack(j, name, yields=True))
+        out.append(link_springs.dress_pack(j, name, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.rising_friction(j, name))
         out.append(friction.position_friction(j, name))
@@ -59,7 +59,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     for j in range(len(names) - 1):
         out.append(structure.joint_coupling(j, j + 1, names[j], names[j + 1]))
     if robot.payload_link in chain.bodies:
-        out.append(structure.payload(robot.payload_link))
+        out.append(bodies.payload(robot.payload_link))
     seen: set[int] = set()
     known = {chain.carriers[joint] for joint in chain.inertias}  # with what they carry
     for link, (index, _) in chain.bodies.items():
@@ -69,12 +69,12 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         carries = index == chain.bodies.get(robot.payload_link, (0, None))[0]
         loaded = index not in known and any(chain.bodies[load.link][0] == index for load in robot.loads)
         for with_load in (False, True)[: 1 + loaded]:
-            out.append(structure.link_inertia(link, _joint_of_body(chain, index), carries, with_load))
+            out.append(bodies.link_inertia(link, _joint_of_body(chain, index), carries, with_load))
     for j, name in enumerate(names):
         # Before the first joint it would be the base that moves.
         for before in (False, True)[: 1 + (j > 0)]:
-            out += [structure.compliance(name, j, axes, "transverse_elasticity", before) for axes in _turned(_across(chain, j))]
-    out += [structure.compliance("base", -1, axes, "base_elasticity") for axes in _turned(np.eye(3))]
+            out += [hinges.compliance(name, j, axes, "transverse_elasticity", before) for axes in _turned(_across(chain, j))]
+    out += [hinges.compliance("base", -1, axes, "base_elasticity") for axes in _turned(np.eye(3))]
     return tuple(out)
 
 

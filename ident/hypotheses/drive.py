@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
-from ident.inverse import Motion
+from ident.motion import Motion
 
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 

@@ -11,7 +11,7 @@ from ident.group import Group
 from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.kernels import smooth_sign
 from ident.hypotheses.yielding import DAHL, bristle
-from ident.inverse import Motion
+from ident.motion import Motion
 
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
@@ -306,14 +306,14 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         (
             Parameter("relative_change", "1", -0.98, 5.0, step=1e-3, center=0.0, spread=0.5, null=0.0),
             Parameter("time_constant", "s", 1.0, 1e5, log=True, step=1e-2),
-            Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True),
+            Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True, reported=True),
             SMOOTHING,
         ),
         law,
         lambda scale: [(f * scale.duration,) for f in (0.1, 0.3, 1.0)] if scale.duration > 0 else [],
         screen,
         "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
-        " of {time_constant:.0f} s.",
+        " of {time_constant:.0f} s; {coulomb:.3g} N m of it is Coulomb friction, at the start.",
         variable="time",
         options={
             "absorbs": "coulomb_friction",

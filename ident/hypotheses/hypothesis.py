@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ident.hypotheses.yielding import SLIP
-from ident.inverse import Motion
+from ident.motion import Motion
 
 LOG_SPREAD = 1.5  # of a positive parameter before the data, natural logarithm
 UNIT_RANGE = 4.0  # between bounds that are physical ones of a pure number

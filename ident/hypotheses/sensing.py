@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
-from ident.inverse import Motion
+from ident.motion import Motion
 
 TRUE_STEPS = 4  # from a measured position to the one at which its error is that of the encoder
 

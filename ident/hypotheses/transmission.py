@@ -9,7 +9,7 @@ import numpy as np
 from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen
 from ident.hypotheses.yielding import elastoplastic
-from ident.inverse import Motion
+from ident.motion import Motion
 
 ROUNDED = 5.0  # exponent of a hysteresis before the data
 SOFTEST = 0.05  # share of its stiffness that a soft middle keeps at least: with less it is a dead band

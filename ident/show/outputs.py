@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ident.excitation import plan_to_toml
 from ident.outputs import outputs_into
+from ident.plan_file import plan_to_toml
 from ident.show.export import write_mjcf, write_model_toml
 from ident.show.recording import write_recording
 from ident.show.report import write_report

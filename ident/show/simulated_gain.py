@@ -10,11 +10,12 @@ import numpy as np
 
 from ident.dataset import Dataset
 from ident.diagnosis import SEED
-from ident.extended import Model, predict
+from ident.extended import predict
 from ident.gain import Errors, mean_squares, measure_gain
 from ident.graybox import parameter_names
 from ident.group import Group
 from ident.identification import identify, with_held_out
+from ident.model import Model
 from ident.output_noise import noise_covariance
 from ident.parallel import one_thread_each
 from ident.problem import Problem, predictions

@@ -15,7 +15,8 @@ import tomlkit
 
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import save_dataset
-from ident.excitation import make_plan, plan_to_toml
+from ident.plan import make_plan
+from ident.plan_file import plan_to_toml
 from robot_assets.robot import load_robot
 from tests.hostile.case import ACCEPTED, REFUSED, Case, flips
 

@@ -1,0 +1,162 @@
+"""Effects of bodies: an unknown load, and links that are not those of the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from ident.chain import LinkChange, Structure, build_structure
+from ident.group import Group
+from ident.hypotheses.hypothesis import Hypothesis, Parameter
+from ident.hypotheses.structure import Change
+from ident.inverse import Plane, coarse_group, inverse_dynamics
+from ident.motion import Solution
+
+LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
+SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
+LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
+
+
+def payload(link: str) -> Hypothesis:
+    """Unknown load with its centre of mass at ``com`` in the frame of the flange's link.
+
+    Its inertia about the centre is that of a body along the axes of the frame: what a ball would leave, a wrong link takes up.
+    """
+
+    def change(p) -> Change:
+        return Change(loads=((link, pin.Inertia(float(p[0]), np.asarray(p[1:4], float), np.diag(p[4:7]))),))
+
+    def responses(structure, par, plane, group, solution, shape):
+        joint, placement = structure.bodies[link]
+        columns = [_move(np.append(unit, np.zeros(6)), placement) for unit in np.eye(4)]
+        return _inertial_responses(structure, joint, columns, plane, group, solution)
+
+    def start(c):
+        if c[0] <= 0:
+            return None
+        return np.concatenate([[c[0]], np.clip(c[1:] / c[0], -0.4, 0.4), np.full(3, c[0] * SMALL_LOAD**2)])
+
+    return Hypothesis(
+        "payload",
+        "flange",
+        -1,
+        "model",
+        (
+            Parameter("mass", "kg", 1e-6, 1e4, log=True, step=1e-3),
+            Parameter("com_x", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
+            Parameter("com_y", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
+            Parameter("com_z", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
+            *(Parameter(f"inertia_{i}", "kg m2", 1e-9, 1e4, log=True, step=1e-1) for i in "xyz"),
+        ),
+        None,
+        lambda scale: [()],
+        None,
+        "An unknown load of {mass:.3g} kg hangs at the flange: anti-resonances fall at every posture and the gravity"
+        " torque changes with them.",
+        variable="posture",
+        options={"body": link, "change": change, "responses": responses, "start": start, "shown": "mass"},
+    )
+
+
+def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_load: bool = False) -> Hypothesis:
+    """Mass, centre of mass and inertia of a link are not those of the model.
+
+    ``mass`` and ``inertia`` (about the centre of mass) are factors, ``com`` is a shift in the frame of
+    the link's joint. The data seldom determine all of them: what they leave open stays near the model.
+
+    Args:
+        carries_load: whether a payload would be part of the same body.
+        with_load: whether the loads that the robot names on it are.
+    """
+
+    def how(p) -> LinkChange:
+        return LinkChange(float(p[0]), (float(p[1]), float(p[2]), float(p[3])), float(p[4]), with_load)
+
+    def responses(structure, par, plane, group, solution, shape):
+        joint, _ = structure.bodies[link]
+        robot = structure.robot if with_load else replace(structure.robot, loads=())
+        bare = build_structure(robot, links=structure.links, inertias=structure.inertias)
+        own = bare.model.inertias[bare.bodies[link][0]]
+        base = own.toDynamicParameters()
+        changed = np.array([1.0, 0.0, 0.0, 0.0, 1.0]) + np.diag(LINK_STEPS)
+        columns = [(how(p).of(own).toDynamicParameters() - base) / h for p, h in zip(changed, LINK_STEPS, strict=True)]
+        return _inertial_responses(structure, joint, columns, plane, group, solution)
+
+    return Hypothesis(
+        "link_inertia",
+        link,
+        joint_index,
+        "model",
+        (
+            Parameter("mass", "1", 0.05, 20.0, log=True, step=1e-4, center=1.0, spread=0.5, null=1.0),
+            Parameter("com_x", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
+            Parameter("com_y", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
+            Parameter("com_z", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
+            Parameter("inertia", "1", 0.02, 50.0, log=True, step=1e-3, center=1.0, spread=0.5, null=1.0),
+        ),
+        None,
+        lambda scale: [()],
+        None,
+        f"The body of {{joint}}{', with the load on it,' if with_load else ''} is not that of the model:"
+        " its mass is {mass:.3g} times, its inertia {inertia:.3g} times"
+        " what the model says, its centre of mass off by ({com_x:.3g}, {com_y:.3g}, {com_z:.3g}) m.",
+        variable="posture",
+        options={
+            "body": link,
+            "nats": -LOAD_NATS if carries_load else 0.0,
+            "with_load": with_load,
+            "carries_load": carries_load,  # what it carries and its own body are one to the data
+            "change": lambda p: Change(links=((link, how(p)),)),
+            "responses": responses,
+            "start": lambda c: np.array(
+                [np.clip(1.0 + c[0], 0.3, 4.0), *np.clip(c[1:4], -0.2, 0.2), np.clip(1.0 + c[4], 0.3, 4.0)]
+            ),
+        },
+    )
+
+
+def _inertial_responses(
+    structure: Structure,
+    joint: int,
+    columns: Sequence[np.ndarray],
+    plane: Plane,
+    group: Group,
+    solution: Solution,
+) -> list[np.ndarray]:
+    """Recorded torques and link positions (S, L, n + M) per unit of inertial parameters added to a body.
+
+    ``columns`` hold dynamic parameters [m, m c, I] (10,) in the frame of the joint; inverse dynamics is
+    linear in them, so that a response is a difference of two inverse dynamics.
+    """
+    coarse = coarse_group(group)
+    slow = len(coarse.omega)
+    motion = [coarse.to_time(plane.s[:slow, None] ** k * solution.Q_a[:, :slow]) for k in range(3)]
+    without = inverse_dynamics(structure, *motion)
+    out = []
+    for column in columns:
+        model = structure.model.copy()
+        model.inertias[joint] = pin.Inertia.FromDynamicParameters(
+            model.inertias[joint].toDynamicParameters() + column
+        )
+        lines = np.zeros_like(solution.Q_a)
+        lines[:, :slow] = coarse.to_lines(inverse_dynamics(replace(structure, model=model), *motion) - without)
+        out.append(np.matmul(plane.output_per_load, lines[..., None])[..., 0])
+    return out
+
+
+def _move(parameters: np.ndarray, placement: pin.SE3) -> np.ndarray:
+    """Dynamic parameters (10,) of a body given in a frame at ``placement`` of its joint.
+
+    Works for parameters that are no body by themselves (a first moment without mass).
+    """
+    if np.allclose(placement.homogeneous, np.eye(4)):
+        return parameters
+    big = pin.Inertia(1e3, np.zeros(3), 1e3 * np.eye(3)).toDynamicParameters()
+
+    def moved(x: np.ndarray) -> np.ndarray:
+        return placement.act(pin.Inertia.FromDynamicParameters(x)).toDynamicParameters()
+
+    return moved(big + parameters) - moved(big)

@@ -1,0 +1,144 @@
+"""A solution of the arm along measured motion, and the time signals of it that laws ask for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ident.graybox import Parameters
+from ident.group import Group, signal_share
+
+
+@dataclass(frozen=True)
+class Torques:
+    """What effects add to the linear arm, as spectra; each (S, L, n) or (S, L, N) for ``link``."""
+
+    spring: np.ndarray | float = 0.0
+    link: np.ndarray | float = 0.0
+    motor: np.ndarray | float = 0.0
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A prediction and its parts; spectra of (S, L, .).
+
+    ``Q_a`` holds all coordinates of the links, ``Q_driven`` those that the joints drive, in their order.
+    """
+
+    Q: np.ndarray
+    Q_a: np.ndarray
+    Q_driven: np.ndarray
+    delta: np.ndarray
+    tau_s: np.ndarray
+    U: np.ndarray
+    W: np.ndarray
+    torques: Torques
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Time signals of a solution, made where they are asked for; each (S, T) on the group's grid.
+
+    ``beside``: spectra (S, L, n) of what else acts at the motors, N m. ``error``: the same, rad, by which the position
+    that laws see is taken off. ``delivered``: the same, N m, what the motors deliver by the record; the record itself where None.
+    ``told``: joints at which the record says another torque already, and none of a friction at rest.
+    """
+
+    group: Group
+    solution: Solution
+    par: Parameters
+    beside: np.ndarray | float = 0.0
+    error: np.ndarray | float = 0.0
+    delivered: np.ndarray | None = None
+    told: frozenset[int] = frozenset()
+
+    def q(self, joint: int) -> np.ndarray:
+        """Motor position without lines of noise alone, rad."""
+        return self._shown(joint, 0)
+
+    def v(self, joint: int) -> np.ndarray:
+        """Motor velocity without lines of noise alone, rad/s."""
+        fast, v = self.group.fast_velocity, self._shown(joint, 1)
+        return v if fast is None else v + fast[..., joint]
+
+    def acceleration(self, joint: int) -> np.ndarray:
+        """Motor acceleration, rad/s2."""
+        return self._time(self.solution.Q, joint, 2)
+
+    def delta(self, joint: int) -> np.ndarray:
+        """Deflection of the gear, rad."""
+        return self._time(self.solution.delta, joint)
+
+    def delta_rate(self, joint: int) -> np.ndarray:
+        """Its rate, rad/s."""
+        return self._time(self.solution.delta, joint, 1)
+
+    def tau_s(self, joint: int) -> np.ndarray:
+        """Torque that the gear carries, N m."""
+        return self._time(self.solution.tau_s, joint)
+
+    def q_link(self, joint: int) -> np.ndarray:
+        """Position of the link behind the gear, rad."""
+        return self._time(self.solution.Q_driven, joint)
+
+    def v_link(self, joint: int) -> np.ndarray:
+        """Its velocity, rad/s."""
+        return self._time(self.solution.Q_driven, joint, 1)
+
+    def torque(self, joint: int) -> np.ndarray:
+        """Recorded motor torque without lines of noise alone, N m."""
+        return self._time(self.group.U, joint, share=self.group.torque_share[..., joint])
+
+    def peak_torque(self, joint: int) -> float:
+        """Largest recorded motor torque, N m; the return that closes a motion was not recorded."""
+        u = np.abs(self.torque(joint))
+        return float(np.max(u if self.group.window is None else u[:, self.group.window > 0.0]))
+
+    def asked(self, joint: int) -> np.ndarray:
+        """Torque that the record leaves to a friction of the motor, N m."""
+        s, x = 1j * self.group.omega, self.solution
+        linear = (s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) * x.Q[..., joint]
+        carried = x.tau_s @ self.par.coupling[:, joint]
+        others = self.beside[..., joint] if isinstance(self.beside, np.ndarray) else self.beside
+        given = self.group.U if self.delivered is None else self.delivered
+        left = given[..., joint] - linear - carried - others
+        # What is cut off at the size of a friction mixes the noise of fast lines, where it is largest, into all.
+        left = signal_share(left, self._asked_noise(joint)) * left
+        return self.group.to_time(left[..., None])[..., 0]
+
+    def asked_noise(self, joint: int) -> float:
+        """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean over records."""
+        return float(np.sqrt(2.0 * np.sum(self._asked_noise(joint))))
+
+    def _asked_noise(self, joint: int) -> np.ndarray:
+        """(L,) its variance, N2 m2."""
+        group, s = self.group, 1j * self.group.omega
+        gain = np.abs(s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) ** 2
+        return (gain * group.white_noise[joint] + group.white_torque_noise[joint]) * np.mean(1.0 / group.periods)
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time since the start of the recording, s."""
+        T = self.group.n_time
+        return self.group.start[:, None] + np.arange(T) * self.group.period_time / T
+
+    @property
+    def time_step(self) -> float:
+        """Step of the grid, s."""
+        return self.group.period_time / self.group.n_time
+
+    def lines(self, x: np.ndarray) -> np.ndarray:
+        """Time signal (S, T) to spectrum (S, L)."""
+        return self.group.to_lines(x[..., None])[..., 0]
+
+    def _shown(self, joint: int, order: int) -> np.ndarray:
+        x = self.group.signal_share[..., joint] * self.solution.Q[..., joint]
+        if isinstance(self.error, np.ndarray):
+            x = x + self.error[..., joint]
+        return self._time(x[..., None], 0, order)
+
+    def _time(self, X: np.ndarray, column: int, order: int = 0, share: np.ndarray | float = 1.0) -> np.ndarray:
+        x = share * X[..., column]
+        x = x * (1j * self.group.omega) ** order if order else x
+        return self.group.to_time(x[..., None])[..., 0]
