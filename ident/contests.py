@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ident.evidence import Candidate, model_error, weigh
 from ident.hypotheses import Hypothesis, catalogue
+from ident.hypotheses.bodies import payload, payload_like
 from ident.model import Effect
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
-from ident.pruning import pruned
+from ident.pruning import pruned, untold
 from ident.refits import (
     FAINT,
     FINALISTS,
@@ -69,7 +70,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         return h.key not in there or (h.key == winner.key and loaded[0] != loaded[1])
 
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
-    rivals = [*rivals[:FINALISTS], *(wider(problem, current, own) if nearly_settled(current) else []), *elsewhere(problem, current, own, others)]
+    rivals = [*rivals[:FINALISTS], *as_load(current, own, others), *elsewhere(problem, current, own, others)]
+    rivals += wider(problem, current, own) if nearly_settled(current) else []
 
     def entered(effect: Effect) -> Fit | None:
         model = replace(current.model, effects=(*others, effect))
@@ -85,7 +87,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     best_of: dict[tuple[str, str], Candidate] = {}
     for c in sorted(ran, key=lambda c: c.fit.cost):
         best_of.setdefault(c.hypothesis.key, c)
-    ran = list(best_of.values())
+    ran = [c for c in best_of.values() if c.hypothesis is own.hypothesis or not same_as_special(c, best_of)]
     excess = model_error(min(c.fit.cost for c in ran), current.count, found.fall)
     weighed = weigh(ran, excess, temper_of(found.before))
     best = weighed[0]
@@ -99,6 +101,25 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
     known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
     return current, replace(found, candidates=tuple(known))
+
+
+def same_as_special(candidate: Candidate, ran: Mapping[tuple[str, str], Candidate]) -> bool:
+    """Whether a candidate is but the special case that it holds, which ran too: a cable that does not rub beside a spring."""
+    h = candidate.hypothesis
+    return (h.options.get("absorbs"), h.place) in ran and untold(candidate.fit, candidate.fit.model.effects[-1])
+
+
+def as_load(current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:
+    """The load that would make of the body that carries one what a change of that body has made of it.
+
+    To the data they are one: a linear step beside causes that were missing may have put the load below nothing.
+    """
+    h, robot = own.hypothesis, current.model.structure.robot
+    if not h.options.get("carries_load") or any(e.hypothesis.effect == "payload" for e in others):
+        return []
+    with_change, without = (m.built()[0] for m in (current.model, replace(current.model, effects=tuple(others))))
+    p = payload_like(robot.payload_link, without, with_change)
+    return [] if p is None else [Effect(payload(robot.payload_link), p)]
 
 
 def elsewhere(problem: Problem, current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:

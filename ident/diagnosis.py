@@ -19,7 +19,7 @@ from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import Parameters
 from ident.group import Group
 from ident.hypotheses.sensing import torque_offset
-from ident.identification import RUNAWAY, Setup, identify, set_up, with_held_out
+from ident.identification import RUNAWAY, Setup, identify, set_up, under_noise_that_is_left, with_held_out
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
 from ident.next_experiment import separating_experiment
@@ -86,7 +86,7 @@ def diagnose_fully(
     recorded = setup.problem.groups
     linked = None if doubts else by_link_encoders(dataset, setup, baseline, max_causes, workers)
     if linked is None or not explained(linked[-1]):
-        result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
+        setup, baseline, result = sought(dataset, setup, baseline, max_causes, workers)
         linked = linked if linked is not None and linked[-1].detected and not result.detected else None
     if linked is not None:
         setup, recorded, baseline, result = linked
@@ -194,6 +194,16 @@ def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
         sentence=f"The recording looks mislabelled, so that no cause can be named: {doubts[0]}",
         notes=(*verdict.notes, *doubts),
     )
+
+
+def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
+    """Causes of what the baseline leaves, sought again where beside them the noise turns out to be far less than was guessed."""
+    result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
+    other, first = under_noise_that_is_left(dataset, setup, result.final)
+    if other is setup or workers.late:
+        return setup, baseline, result
+    workers.say("less noise")
+    return other, first, attribute(other.problem, first, max_causes=max_causes, workers=workers)
 
 
 def unresolved(result: Attribution) -> bool:

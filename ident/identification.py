@@ -14,7 +14,7 @@ from ident.dataset import Dataset
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from ident.group import Group
 from ident.inverse import Sampling
-from ident.noise import drifting, sample_noise, unexcited_noise
+from ident.noise import DOUBT, drifting, sample_noise, torque_noise_left, unexcited_noise, white_covariance
 from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps
@@ -29,6 +29,8 @@ POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
 LEAST_HELD_OUT = 2.0  # s of it
+RENEWALS = 3  # at most, of such noise
+LOUD = 2.0  # power of noise as it was guessed, over that which is found, from which it is lowered
 RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
 
 
@@ -138,10 +140,14 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
         else:
             signals = [getattr(s, channel) for s in dataset.segments]
             each = np.median([difference_noise(x) for x in signals], axis=0)
-            size = np.median([np.std(x, axis=0) for x in signals], axis=0)
-            floor = 1e-9 if channel == "q" else 1e-6
-            out.append(np.maximum(each, np.maximum(LEAST_NOISE[channel] * size, floor)))
+            out.append(np.maximum(each, least_noise(dataset, channel)))
     return out[0], out[1]
+
+
+def least_noise(dataset: Dataset, channel: str) -> np.ndarray:
+    """(n,) noise of the samples of a channel that is taken at least, rad or N m."""
+    size = np.median([np.std(getattr(s, channel), axis=0) for s in dataset.segments], axis=0)
+    return np.maximum(LEAST_NOISE[channel] * size, 1e-9 if channel == "q" else 1e-6)
 
 
 @one_thread_each
@@ -154,6 +160,7 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
         if louder is not setup.problem:
             setup = replace(setup, problem=louder)
             result = fit_baseline(louder, progress)
+        setup, result = under_noise_that_is_left(dataset, setup, result, progress)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
         raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
@@ -165,7 +172,7 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
 
 def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
     """Sample noise that was guessed, raised to what lines show that nothing excites, where periods show no scatter."""
-    guessed = [not (given is not None and np.all(given > 0)) for given in (dataset.q_std, dataset.tau_std)]
+    guessed = guessed_noise(dataset)
     single = all(g.window is None and g.U_periods.shape[1] == 1 for g in problem.groups)
     if not single or not any(guessed) or result.chi2_per_dof <= DETECTION_EXCESS:
         return problem
@@ -174,6 +181,53 @@ def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fi
     factor = np.sqrt(unexcited_noise(problem.groups, [result.weights.apply(i, x) for i, x in enumerate(residuals)]))
     q_std, tau_std = (std * factor if unknown else std for std, unknown in zip((problem.q_std, problem.tau_std), guessed, strict=True))
     return replace(problem, q_std=q_std, tau_std=tau_std) if factor > 1.0 else problem
+
+
+def under_noise_that_is_left(
+    dataset: Dataset, setup: Setup, result: Fit, progress: Callable[[str], None] | None = None
+) -> tuple[Setup, Fit]:
+    """The setup under ``with_noise_that_is_left`` of a fit, and the first model under it; both as they are where that is no less.
+
+    ``result`` is the first model, or one extended by causes: the more it explains, the more its residual tells.
+    """
+    first = result
+    for _ in range(RENEWALS):
+        quieter = with_noise_that_is_left(dataset, setup.problem, result)
+        if quieter is setup.problem:
+            break
+        setup = replace(setup, problem=quieter)
+        first = result = fit_baseline(quieter, progress)
+    return setup, first
+
+
+def guessed_noise(dataset: Dataset) -> list[bool]:
+    """Whether the noise of position and of torque are not given."""
+    return [not (given is not None and np.all(given > 0)) for given in (dataset.q_std, dataset.tau_std)]
+
+
+def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
+    """Noise of the torque that was guessed, lowered to what a fit leaves where that is far less and periods show no scatter.
+
+    Differences of samples tell what circulates in the loop too: a differentiating controller makes of the noise of the encoder
+    ten times that of the torque sensor and more, which cancels in the torque residual.
+    """
+    if not guessed_noise(dataset)[1] or any(g.window is None and g.U_periods.shape[1] > 1 for g in problem.groups):
+        return problem
+    n = problem.structure.n
+    left, shares = [], []
+    for i, (group, pred) in enumerate(zip(problem.groups, predictions(problem, result.model, result.remainders), strict=True)):
+        left.append(result.weights.apply(i, output_error(group, pred))[..., :n])
+        position = white_covariance(pred.sampled_impedance[: group.n_compared], 0.0 * problem.q_std, problem.q_std**2)
+        position = np.diagonal(position, axis1=1, axis2=2).real
+        shares.append(problem.tau_std**2 / (problem.tau_std**2 + position))
+    # Lines of a motion are seen through its window: their squares are told in units of the numbers that they are.
+    mean = np.concatenate([np.abs(X[:, 1:]).reshape(-1, n) ** 2 for X in left]).mean(axis=0)
+    unit = np.sqrt(result.costs / result.counts / np.maximum(mean, 1e-300))
+    power = DOUBT * torque_noise_left([X * unit for X in left], shares)
+    if np.all(LOUD * power > 1.0):
+        return problem
+    found = np.maximum(problem.tau_std * np.sqrt(power), least_noise(dataset, "tau"))
+    return replace(problem, tau_std=np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(found, problem.tau_std)))
 
 
 def with_measured_noise(problem: Problem, result: Fit) -> Problem:

@@ -18,6 +18,8 @@ from ident.group import Group, mean_over_lines
 PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
+QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
+DOUBT = 1.5  # of the power of noise, by which what such lines hold may be too little
 BAND_LINES = 20  # of a band in which the coherence of neighbouring lines is taken
 TOGETHER, NO_CHANCE = 0.8, 5.0  # coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
 
@@ -141,6 +143,28 @@ def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> 
         return 1.0
     at_excited, at_others = power / count
     return float(max(at_others, 1.0)) if at_excited < FLAT * at_others else 1.0
+
+
+def torque_noise_left(whitened: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> np.ndarray:
+    """Power of white noise of the torque samples that a model leaves room for, over that which was assumed; (n,).
+
+    What a model leaves is never less than noise. Of each band of lines a quantile is taken, which what is missing in few of
+    them moves little, and the quietest bands count most.
+
+    Args:
+        whitened: (S, K, n) residual by group, of unit mean power for noise as assumed.
+        shares: (K, n) of the torque in that noise; the rest is that of the positions.
+    """
+    found, told = 0.0, 0.0
+    for Z, share in zip(whitened, shares, strict=True):
+        for first in range(1, Z.shape[1] - BAND_LINES // 2, BAND_LINES):
+            band = slice(first, first + BAND_LINES)
+            power = np.abs(Z[:, band]).reshape(-1, Z.shape[-1]) ** 2
+            quiet = np.quantile(power, QUIET, axis=0) / -np.log(1.0 - QUIET)  # the power of a line of noise is exponential
+            weight, torque = 1.0 / np.maximum(quiet, 1e-12) ** 2, share[band].mean(axis=0)
+            found = found + weight * torque * (quiet - (1.0 - torque))
+            told = told + weight * torque**2
+    return np.maximum(found, 0.0) / np.maximum(told, 1e-300)
 
 
 def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -100,7 +100,6 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
     """
     known = {h.key: h for h in hypotheses}
     special_by_itself = partial(plainly_special, problem, result.model)
-    std = dict(zip(result.names, np.sqrt(np.maximum(np.diag(result.covariance()), 0.0)), strict=True))
 
     def plain(effect: Effect) -> Effect:
         h = effect.hypothesis
@@ -108,7 +107,7 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
         if h.key in kept or special is None or "apart" not in h.options:
             return effect
         hidden = h.options.get("give", lambda p: np.inf)(effect.p) < problem.q_std[h.joint]
-        if std[h.coordinate(h.options['apart'])] < UNTOLD and not hidden and not special_by_itself(effect):
+        if not untold(result, effect) and not hidden and not special_by_itself(effect):
             return effect
         return Effect(special, clip_to_bounds(special, h.options["special"](effect.p)))
 
@@ -122,6 +121,15 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
     # One that has reached what makes it its special case is that one, whatever errors of the law make of the rest.
     certain = all(a is b or special_by_itself(a) for a, b in zip(result.model.effects, effects, strict=True))
     return other if certain or other.cost - same.cost < swapped * MIN_EVIDENCE * scale else result
+
+
+def untold(result: Fit, effect: Effect) -> bool:
+    """Whether the data say nothing of what sets an effect of a fit apart from the special case that it holds."""
+    h = effect.hypothesis
+    if "apart" not in h.options:
+        return False
+    variance = dict(zip(result.names, np.diag(result.covariance()), strict=True))
+    return bool(variance[h.coordinate(h.options["apart"])] >= UNTOLD**2)
 
 
 def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:

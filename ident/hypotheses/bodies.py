@@ -17,6 +17,7 @@ from ident.motion import Solution
 
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
 SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
+FARTHEST = 2.0  # m, of the centre of mass of a load
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
 
 
@@ -46,9 +47,9 @@ def payload(link: str) -> Hypothesis:
         "model",
         (
             Parameter("mass", "kg", 1e-6, 1e4, log=True, step=1e-3),
-            Parameter("com_x", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
-            Parameter("com_y", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
-            Parameter("com_z", "m", -2.0, 2.0, step=1e-3, center=0.0, spread=0.2),
+            Parameter("com_x", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2),
+            Parameter("com_y", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2),
+            Parameter("com_z", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2),
             *(Parameter(f"inertia_{i}", "kg m2", 1e-9, 1e4, log=True, step=1e-1) for i in "xyz"),
         ),
         None,
@@ -59,6 +60,17 @@ def payload(link: str) -> Hypothesis:
         variable="posture",
         options={"body": link, "change": change, "responses": responses, "start": start, "shown": "mass"},
     )
+
+
+def payload_like(link: str, without: Structure, changed: Structure) -> np.ndarray | None:
+    """Parameters of a ``payload`` that has the mass and first moment by which the body of a link differs in two chains; None where
+    it has become lighter."""
+    joint, placement = without.bodies[link]
+    mass, *moment = (changed.model.inertias[joint].toDynamicParameters() - without.model.inertias[joint].toDynamicParameters())[:4]
+    if mass <= 0.0:
+        return None
+    com = placement.actInv(np.array(moment) / mass)
+    return np.concatenate([[mass], np.clip(com, -FARTHEST, FARTHEST), np.full(3, mass * SMALL_LOAD**2)])
 
 
 def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_load: bool = False) -> Hypothesis:

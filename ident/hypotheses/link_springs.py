@@ -81,5 +81,7 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
             "trivial": lambda p, k: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
             "absorb": lambda p, weights, old: np.array([old[0], p[1], p[2]]),
+            "apart": "friction",
+            "special": lambda p: np.array([p[0], 0.0]),
         },
     )

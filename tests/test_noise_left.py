@@ -1,0 +1,60 @@
+"""Noise of the torque where no period repeats: differences of samples tell what circulates in the loop too; a residual is never less than noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.identification import identify, set_up
+from ident.noise import DOUBT, torque_noise_left
+from sim import parse_effect, run_experiment
+from tests.conftest import small_plan, through_files
+
+
+def spectra(rng, power, records=3):
+    """(S, K, n) lines of noise of a power (K, n)."""
+    shape = (records, *power.shape)
+    return np.sqrt(power / 2) * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
+
+
+@pytest.mark.parametrize("torque", [0.01, 0.3, 1.0])
+@pytest.mark.parametrize("lacks", [0.0, 300.0])
+def test_the_power_of_the_torque_noise_is_found_beside_that_of_the_positions(torque, lacks):
+    rng, K = np.random.default_rng(5), 401
+    # Noise of the positions rises with frequency; that of the torque was assumed to be 1.
+    position = np.linspace(1e-3, 3.0, K)[:, None] ** 2 * np.ones(2)
+    share = 1.0 / (1.0 + position)
+    Z = spectra(rng, (torque + position) * share)
+    Z[:, 1::8] += np.sqrt(lacks * share[1::8])  # what a model lacks is in few lines
+    found = torque_noise_left([Z], [share])
+    # Where the noise of a band is not even, a quantile tells too little; the doubt makes up for that.
+    assert np.all(DOUBT * found > 0.9 * torque)
+    # A bound: with an eighth of the lines away the quantile is a higher one of what is noise there.
+    assert np.all(found < (3.0 if lacks else 1.2) * torque)
+
+
+@pytest.fixture(scope="module")
+def motions(ur10, tmp_path_factory):
+    """Two motions of an arm with a little Coulomb friction, without words on noise."""
+    plan = small_plan(ur10, 31, points=1, trajectory=True)
+    (motion,) = plan.trajectories
+    named = tuple(
+        replace(motion, name=name, role=role) for name, role in (("m1", "identification"), ("m2", "validation"))
+    )
+    hidden = parse_effect("coulomb_friction@elbow_joint:torque=0.5", ur10)
+    data = run_experiment(replace(plan, experiments=(), trajectories=named), [hidden], seed=31)
+    return replace(through_files(data, tmp_path_factory.mktemp("motions")), q_std=None, tau_std=None)
+
+
+def test_a_guess_far_above_what_motions_leave_is_lowered_to_that(motions, ur10):
+    """Fourth differences of a torque that moves an arm are more than those of its sensor; what a model leaves in the band is not."""
+    guessed, (setup, _), true = set_up(motions).problem.tau_std, identify(motions), ur10.array("tau_std")
+    assert np.all(guessed[:3] > 8.0 * true[:3])
+    assert np.all(guessed[:2] > 8.0 * setup.problem.tau_std[:2])
+    assert np.all(setup.problem.tau_std[:2] < 2.0 * true[:2])
+    assert np.all(setup.problem.tau_std > 0.8 * true)
+
+
+def test_noise_that_is_given_stays(motions, ur10):
+    given = replace(motions, tau_std=30.0 * ur10.array("tau_std"))
+    assert np.array_equal(identify(given)[0].problem.tau_std, given.tau_std)
