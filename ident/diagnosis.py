@@ -199,7 +199,10 @@ def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
 def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
     """Causes of what the baseline leaves, sought again where beside them the noise turns out to be far less than was guessed."""
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
-    other, first = under_noise_that_is_left(dataset, setup, result.final)
+    try:
+        other, first = under_noise_that_is_left(dataset, setup, result.final)
+    except NOT_COMPUTED:
+        return setup, baseline, result
     if other is setup or workers.late:
         return setup, baseline, result
     workers.say("less noise")

@@ -10,16 +10,21 @@ from hypothesis import strategies as st
 
 from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, companions, less_errors_of_laws
 from ident.baseline import astray
+from ident.chain import build_structure
 from ident.conclude import _cause, conclude, faint_note
+from ident.contests import same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
-from ident.diagnosis import diagnose, harmful
+from ident.diagnosis import diagnose, harmful, left_over
 from ident.evidence import ABSENT, POINTLESS_NATS, TEMPER, Candidate, explained, occam, pointless, weigh
+from ident.graybox import Parameters
 from ident.hypotheses import catalogue
+from ident.hypotheses.bodies import payload, payload_like
 from ident.hypotheses.hinges import hinge_inertia
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
+from ident.hypotheses.structure import apply_change
 from ident.identification import identify
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, stalled
 from ident.model import Effect, along_record
@@ -954,3 +959,28 @@ def test_a_cause_of_the_whole_arm_is_shown_at_one_joint():
     bare = [SimpleNamespace(U=g.U + x) for g, x in zip(groups, off, strict=True)]
     assert most_affected(SimpleNamespace(groups=groups), bare) == 0
     assert most_affected(SimpleNamespace(groups=groups[:1]), bare[:1]) == 1
+
+
+def test_what_is_left_is_compared_joint_by_joint():
+    counts = np.full(3, 100.0)
+    # One joint far above the others says no more than these.
+    rough, better = (SimpleNamespace(costs=np.array(x) * counts, counts=counts) for x in ([1e4, 8.0, 0.5], [1e4, 1.0, 0.9]))
+    assert left_over(better, rough) == pytest.approx(0.5) and left_over(rough, better) == pytest.approx(2.0)
+
+
+def test_a_load_is_the_change_of_its_body(ur10):
+    """Mass and first moment of a load come back from the chain that carries it, in the frame of the flange's link."""
+    link, p = ur10.payload_link, np.array([0.7, 0.03, -0.05, 0.11, 1e-4, 2e-4, 3e-4])
+    par, bare = Parameters.nominal(ur10), build_structure(ur10)
+    loaded, _ = apply_change(bare, par, payload(link).options["change"](p))
+    assert payload_like(link, bare, loaded)[:4] == pytest.approx(p[:4])
+    assert payload_like(link, loaded, bare) is None
+
+
+def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named):
+    _, setup, result = identified
+    model = replace(result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2])),))
+    fitted = refit(setup.problem, model, result.weights, result.remainders, 1)
+    cable = Candidate(fitted.model.effects[-1].hypothesis, fitted, 0.0)
+    spring = named["gravity_spring", "elbow_joint"].key
+    assert same_as_special(cable, {spring: cable}) and not same_as_special(cable, {})
