@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from ident.baseline import DETECTION_EXCESS, fit_baseline
 from ident.chain import Structure, build_structure
 from ident.channel_checks import MOVES
 from ident.dataset import Dataset
+from ident.extended import Prediction
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from ident.group import Group
 from ident.inverse import Sampling
@@ -170,6 +171,11 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     return replace(setup, problem=problem), result
 
 
+def whitened(problem: Problem, result: Fit, found: Sequence[Prediction]) -> list[np.ndarray]:
+    """(S, K, n + M) of what a fit leaves, under its weights, by group; ``found`` is what it predicts."""
+    return [result.weights.apply(i, output_error(g, p)) for i, (g, p) in enumerate(zip(problem.groups, found, strict=True))]
+
+
 def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
     """Sample noise that was guessed, raised to what lines show that nothing excites, where periods show no scatter."""
     guessed = guessed_noise(dataset)
@@ -177,8 +183,7 @@ def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fi
     if not single or not any(guessed) or result.chi2_per_dof <= DETECTION_EXCESS:
         return problem
     found = predictions(problem, result.model, result.remainders)
-    residuals = [output_error(g, p) for g, p in zip(problem.groups, found, strict=True)]
-    factor = np.sqrt(unexcited_noise(problem.groups, [result.weights.apply(i, x) for i, x in enumerate(residuals)]))
+    factor = np.sqrt(unexcited_noise(problem.groups, whitened(problem, result, found)))
     q_std, tau_std = (std * factor if unknown else std for std, unknown in zip((problem.q_std, problem.tau_std), guessed, strict=True))
     return replace(problem, q_std=q_std, tau_std=tau_std) if factor > 1.0 else problem
 
@@ -213,21 +218,21 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
     """
     if not guessed_noise(dataset)[1] or any(g.window is None and g.U_periods.shape[1] > 1 for g in problem.groups):
         return problem
-    n = problem.structure.n
-    left, shares = [], []
-    for i, (group, pred) in enumerate(zip(problem.groups, predictions(problem, result.model, result.remainders), strict=True)):
-        left.append(result.weights.apply(i, output_error(group, pred))[..., :n])
+    n, shares = problem.structure.n, []
+    found = predictions(problem, result.model, result.remainders)
+    for group, pred in zip(problem.groups, found, strict=True):
         position = white_covariance(pred.sampled_impedance[: group.n_compared], 0.0 * problem.q_std, problem.q_std**2)
         position = np.diagonal(position, axis1=1, axis2=2).real
         shares.append(problem.tau_std**2 / (problem.tau_std**2 + position))
+    left = [X[..., :n] for X in whitened(problem, result, found)]
     # Lines of a motion are seen through its window: their squares are told in units of the numbers that they are.
     mean = np.concatenate([np.abs(X[:, 1:]).reshape(-1, n) ** 2 for X in left]).mean(axis=0)
     unit = np.sqrt(result.costs / result.counts / np.maximum(mean, 1e-300))
     power = DOUBT * torque_noise_left([X * unit for X in left], shares)
     if np.all(LOUD * power > 1.0):
         return problem
-    found = np.maximum(problem.tau_std * np.sqrt(power), least_noise(dataset, "tau"))
-    return replace(problem, tau_std=np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(found, problem.tau_std)))
+    lowered = np.maximum(problem.tau_std * np.sqrt(power), least_noise(dataset, "tau"))
+    return replace(problem, tau_std=np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(lowered, problem.tau_std)))
 
 
 def with_measured_noise(problem: Problem, result: Fit) -> Problem:

@@ -20,7 +20,7 @@ SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
 DOUBT = 1.5  # of the power of noise, by which what such lines hold may be too little
-BAND_LINES = 20  # of a band in which the coherence of neighbouring lines is taken
+BAND_LINES = 20  # of a band in which a quantile, or the coherence of neighbouring lines, is taken
 TOGETHER, NO_CHANCE = 0.8, 5.0  # coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ident.diagnosis import diagnose
 from ident.identification import identify, set_up
 from ident.noise import DOUBT, torque_noise_left
 from sim import parse_effect, run_experiment
@@ -58,3 +59,13 @@ def test_a_guess_far_above_what_motions_leave_is_lowered_to_that(motions, ur10):
 def test_noise_that_is_given_stays(motions, ur10):
     given = replace(motions, tau_std=30.0 * ur10.array("tau_std"))
     assert np.array_equal(identify(given)[0].problem.tau_std, given.tau_std)
+
+
+def test_causes_are_sought_again_where_they_hid_how_little_noise_there_is(motions):
+    told: list[str] = []
+    verdict = diagnose(motions, progress=told.append)
+    assert "less noise" in told
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("coulomb_friction", "elbow_joint")]
+    # Under the noise that the baseline leaves room for the floor is more than twice what is left.
+    elbow = verdict.gain.by_joint["elbow_joint"]
+    assert elbow.noise_floor < 2.0 * elbow.after
