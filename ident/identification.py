@@ -218,15 +218,17 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
     """
     if not guessed_noise(dataset)[1] or any(g.window is None and g.U_periods.shape[1] > 1 for g in problem.groups):
         return problem
-    n, shares = problem.structure.n, []
+    n, left, shares = problem.structure.n, [], []
     found = predictions(problem, result.model, result.remainders)
-    for group, pred in zip(problem.groups, found, strict=True):
+    for i, (group, pred) in enumerate(zip(problem.groups, found, strict=True)):
         position = white_covariance(pred.sampled_impedance[: group.n_compared], 0.0 * problem.q_std, problem.q_std**2)
         position = np.diagonal(position, axis1=1, axis2=2).real
         shares.append(problem.tau_std**2 / (problem.tau_std**2 + position))
-    left = [X[..., :n] for X in whitened(problem, result, found)]
+        # Joint by joint: what whitening takes from one joint for what others show is no measure of its own two noises.
+        assumed = np.diagonal(result.weights.covariance[i], axis1=1, axis2=2)[:, :n].real
+        left.append(output_error(group, pred)[..., :n] * np.sqrt(2.0 / assumed))
     # Lines of a motion are seen through its window: their squares are told in units of the numbers that they are.
-    mean = np.concatenate([np.abs(X[:, 1:]).reshape(-1, n) ** 2 for X in left]).mean(axis=0)
+    mean = np.concatenate([np.abs(X[:, 1:, :n]).reshape(-1, n) ** 2 for X in whitened(problem, result, found)]).mean(axis=0)
     unit = np.sqrt(result.costs / result.counts / np.maximum(mean, 1e-300))
     power = DOUBT * torque_noise_left([X * unit for X in left], shares)
     if np.all(LOUD * power > 1.0):

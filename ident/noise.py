@@ -20,6 +20,8 @@ SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
 DOUBT = 1.5  # of the power of noise, by which what such lines hold may be too little
+SURE = 1.0  # standard deviations of that power, from the number of such lines
+HALVINGS, LEAST_POWER = 24, 1e-9  # of the interval of that power, and the least that a line is assumed to hold
 BAND_LINES = 20  # of a band in which a quantile, or the coherence of neighbouring lines, is taken
 TOGETHER, NO_CHANCE = 0.8, 5.0  # coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
 
@@ -146,10 +148,11 @@ def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> 
 
 
 def torque_noise_left(whitened: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> np.ndarray:
-    """Power of white noise of the torque samples that a model leaves room for, over that which was assumed; (n,).
+    """Power of white noise of the torque samples that a model leaves room for, over that which was assumed; (n,), at most 1.
 
-    What a model leaves is never less than noise. Of each band of lines a quantile is taken, which what is missing in few of
-    them moves little, and the quietest bands count most.
+    What a model leaves is never less than noise. In each band of lines that power is sought at which a quantile is that of noise,
+    which what is missing in few of them moves little. Bands count by how far they narrow it down, so that the quietest count
+    most; ``SURE`` of its standard deviations are added, as where the noise of the positions hides it.
 
     Args:
         whitened: (S, K, n) residual by group, of unit mean power for noise as assumed.
@@ -159,12 +162,30 @@ def torque_noise_left(whitened: Sequence[np.ndarray], shares: Sequence[np.ndarra
     for Z, share in zip(whitened, shares, strict=True):
         for first in range(1, Z.shape[1] - BAND_LINES // 2, BAND_LINES):
             band = slice(first, first + BAND_LINES)
-            power = np.abs(Z[:, band]).reshape(-1, Z.shape[-1]) ** 2
-            quiet = np.quantile(power, QUIET, axis=0) / -np.log(1.0 - QUIET)  # the power of a line of noise is exponential
-            weight, torque = 1.0 / np.maximum(quiet, 1e-12) ** 2, share[band].mean(axis=0)
-            found = found + weight * torque * (quiet - (1.0 - torque))
-            told = told + weight * torque**2
-    return np.maximum(found, 0.0) / np.maximum(told, 1e-300)
+            power, torque = np.abs(Z[:, band]) ** 2, share[band]
+            quiet = power_of_noise(power, torque)
+            slope = np.mean(torque / (torque * quiet + 1.0 - torque), axis=0)
+            # Lines of noise have exponential powers, and a quantile of N of them varies by this (Kendall and Stuart 1977, 14.2).
+            relative = np.sqrt(QUIET / (1.0 - QUIET) / power[..., 0].size) / -np.log(1.0 - QUIET)
+            weight = (slope / relative) ** 2
+            found, told = found + weight * quiet, told + weight
+    return np.minimum(found / told + SURE / np.sqrt(told), 1.0)
+
+
+def power_of_noise(power: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """The part of the assumed power of one of two noises at which the ``QUIET`` quantile of lines is that of noise; (n,), 0 to 1.
+
+    Args:
+        power: (S, L, n) of the lines, over that of both noises as assumed.
+        share: (L, n) of the former in it.
+    """
+    low, high = np.zeros(share.shape[1]), np.ones(share.shape[1])
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        ratio = power / np.maximum(share * middle + 1.0 - share, LEAST_POWER)
+        louder = np.quantile(ratio, QUIET, axis=(0, 1)) > -np.log(1.0 - QUIET)
+        low, high = np.where(louder, middle, low), np.where(louder, high, middle)
+    return high
 
 
 def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
