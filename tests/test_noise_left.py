@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnosis import diagnose
 from ident.baseline import fit_baseline
+from ident.diagnosis import diagnose
 from ident.identification import identify, set_up, with_noise_that_is_left
 from ident.noise import DOUBT, torque_noise_left
 from sim import parse_effect, run_experiment
