@@ -113,12 +113,8 @@ def attribute(
                 break
             p_detected = p_detected if loud or rounds else by_chance
         workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
-        # What is left beside a cause is mostly what its law lacks, and no hinge unless little is left; what is faint asks for one everywhere
-        # only where one at some place shows it best: steps along those of other places may have a wrong sign.
+        # What is left beside a cause is mostly what its law lacks, and no hinge unless little is left; what is faint shows none everywhere.
         bare = np.inf if rounds or faint else worth_a_hinge(current)
-        if faint and "hinge" in asked[0].options:
-            asked = (*asked, *(h for h in hypotheses if "hinge" in h.options and all(h is not a for a in asked)))
-            bare = -np.inf
         least = 0.0 if faint else worth_a_refit(current)
         quiet = frozenset() if faint else shadows(problem, current, rounds)
         found = attribute_once(problem, current, asked, workers, least, bare, quiet)

@@ -22,8 +22,8 @@ from ident.screening import Score, screen
 from ident.torque_fit import Fit
 
 SEEN = 32.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
-ROUGH = 10.0  # factor on that where noise is known less well: by no scatter between periods, by a few draws beside a law along the
-# record, or beside one under which single records may be in another steady motion than the model
+ROUGH = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws, or one under which single
+# records may be in another steady motion than the model
 LINEAR = 0.3  # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
 SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 
@@ -40,7 +40,7 @@ def hidden(
         The hypotheses, and about the probability that the best of all explains so much of noise alone (Bonferroni, a trial each).
     """
     scores = faint_scores(problem, current, hypotheses, told)
-    clear = seen(problem, scores, current)
+    clear = seen(scores, current)
     if clear is None:
         return (), 1.0
     chance = min(1.0, len(scores) * scipy.stats.chi2.sf(clear.gain, clear.dof))
@@ -50,13 +50,15 @@ def hidden(
 def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray) -> list[Score]:
     """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
 
-    None of motions, nor beside link encoders, of which the weights follow what the model leaves. None where periods drift, at that joint or of the whole chain: a few numbers explain much of such
+    None where the noise is not measured by the scatter between periods, nor beside link encoders, of which the weights follow
+    what the model leaves. None where periods drift, at that joint or of the whole chain: a few numbers explain much of such
     noise. None at the joint of a law along the record, which turns noise into a signal of its own there.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.
     """
-    if any(g.window is not None or g.links for g in problem.groups):
+    measured = all(g.window is None and g.U_periods.shape[1] > 1 and not g.links for g in problem.groups)
+    if not measured:
         return []
     along = {e.hypothesis.joint for e in current.model.effects if is_along_record(e.hypothesis)}
     drift = set(np.flatnonzero(drifting(problem.groups)))
@@ -88,12 +90,11 @@ def left_by_laws(current: Fit, told: np.ndarray) -> np.ndarray:
     return share * told
 
 
-def seen(problem: Problem, scores: Sequence[Score], current: Fit) -> Score | None:
+def seen(scores: Sequence[Score], current: Fit) -> Score | None:
     """The clearest score, if noise does not come near it by chance, nor noise that was estimated too small at its joint."""
     whole = max(1.0, current.chi2_per_dof)
     by_joint = np.maximum(current.costs / np.maximum(current.counts, 1.0), whole)
-    measured = all(g.U_periods.shape[1] > 1 for g in problem.groups)
-    least = SEEN * (ROUGH if has_rough_law(current.model) or not measured else 1.0)
+    least = SEEN * (ROUGH if has_rough_law(current.model) else 1.0)
     return next((s for s in scores if s.gain > least * _at(s.hypothesis, by_joint, whole)), None)
 
 

@@ -36,7 +36,6 @@ PER_EFFECT = 2  # of one effect, at most
 NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
 NEAR_BODY = 1.0 / 3.0  # the same of a body's inertia, where one answers best
 MID_RESONANCE, MID_RATIO = 0.425, 0.05  # of a hinge that screening does not place: over the highest line, damping
-ABOVE_BAND = 2.0  # the former of one that is faint: it gives a little, and a resonance among the lines would be loud
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
 WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: linear steps understate strong effects
@@ -164,8 +163,7 @@ def explore(
 
     Args:
         least: share of the excess over noise that a linear step must explain for any to be refitted.
-        bare: share of it that the best may leave after the first steps, beyond which hinges are tried everywhere; where it is
-            -inf always, of resonances above the band.
+        bare: share of it that the best may leave after the first steps, beyond which hinges are tried everywhere.
         rough: the first steps are enough where they answer: the candidates are fitted again.
         quiet: joints at which what is left asks for no hinge.
     """
@@ -203,7 +201,7 @@ def explore(
     allowed = (DETECTION_EXCESS - 1.0) * np.sum(stage.counts[seen])
     unclear = stage.chi2_per_dof <= FAINT and not has_rough_law(stage.model) and left_by(found, seen) > allowed
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
-        found += begun(hinges_everywhere(problem, preds, scores, MID_RESONANCE if bare >= 0.0 else ABOVE_BAND))
+        found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
     if not (rough and left_by(found) < ANSWERED * excess):
         last = workers.map(finished, [r for _, r in found])
@@ -295,17 +293,15 @@ def other_bodies(found: Sequence[tuple[Hypothesis, Fit]], tried: Sequence[Score]
     return [s for s in bodies if all(s is not t for t in tried) and s.gain >= NEAR_BODY * bodies[0].gain]
 
 
-def hinges_everywhere(
-    problem: Problem, preds: Sequence[Prediction], scores: Sequence[Score], resonance: float = MID_RESONANCE
-) -> list[Score]:
-    """A hinge at each place where there may be one, of a ``resonance`` over the highest line.
+def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Sequence[Score]) -> list[Score]:
+    """A hinge at each place where there may be one, of a resonance within the band.
 
     The gears have taken up the best part of one that is missing: a linear step from there has a wrong sign, or
     answers at another joint.
     """
-    frequency = resonance * signal_scale(problem, preds, 0, ()).highest_line
+    middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).highest_line
     hinges = [s for s in scores if "hinge" in s.hypothesis.options]
     return [
-        replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], frequency, MID_RATIO), step=None)
+        replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO), step=None)
         for s in hinges
     ]
