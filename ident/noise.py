@@ -147,19 +147,20 @@ def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> 
     return float(max(at_others, 1.0)) if at_excited < FLAT * at_others else 1.0
 
 
-def torque_noise_left(whitened: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> np.ndarray:
+def torque_noise_left(left: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> np.ndarray:
     """Power of white noise of the torque samples that a model leaves room for, over that which was assumed; (n,), at most 1.
 
     What a model leaves is never less than noise. In each band of lines that power is sought at which a quantile is that of noise,
     which what is missing in few of them moves little. Bands count by how far they narrow it down, so that the quietest count
-    most; ``SURE`` of its standard deviations are added, as where the noise of the positions hides it.
+    most; ``SURE`` of its standard deviations are added, as where the noise of the positions hides it. Fewer lines than half a band
+    tell nothing.
 
     Args:
-        whitened: (S, K, n) residual by group, of unit mean power for noise as assumed.
+        left: (S, K, n) residual by group, each joint of unit mean power for noise as assumed.
         shares: (K, n) of the torque in that noise; the rest is that of the positions.
     """
-    found, told = 0.0, 0.0
-    for Z, share in zip(whitened, shares, strict=True):
+    found, told = np.zeros(shares[0].shape[1]), np.zeros(shares[0].shape[1])
+    for Z, share in zip(left, shares, strict=True):
         for first in range(1, Z.shape[1] - BAND_LINES // 2, BAND_LINES):
             band = slice(first, first + BAND_LINES)
             power, torque = np.abs(Z[:, band]) ** 2, share[band]
@@ -169,6 +170,7 @@ def torque_noise_left(whitened: Sequence[np.ndarray], shares: Sequence[np.ndarra
             relative = np.sqrt(QUIET / (1.0 - QUIET) / power[..., 0].size) / -np.log(1.0 - QUIET)
             weight = (slope / relative) ** 2
             found, told = found + weight * quiet, told + weight
+    told = np.maximum(told, 1e-300)
     return np.minimum(found / told + SURE / np.sqrt(told), 1.0)
 
 

@@ -46,6 +46,11 @@ def test_noise_of_positions_that_rises_steeply_within_a_band_does_not_hide_that_
     assert np.median(found) < 2.0 * 0.02
 
 
+def test_few_lines_tell_nothing_of_the_noise():
+    share = np.full((8, 2), 0.5)
+    assert np.array_equal(torque_noise_left([spectra(np.random.default_rng(0), 0.1 * share)], [share]), np.ones(2))
+
+
 @pytest.fixture(scope="module")
 def motions(ur10, tmp_path_factory):
     """Two motions of an arm with a little Coulomb friction, without words on noise."""
