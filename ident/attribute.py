@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, implausible
+from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, implausible, loud
 from ident.contests import weighed_again
 from ident.evidence import Candidate, last_is_pointless
 from ident.faint import SEEN, hidden
@@ -98,20 +98,21 @@ def attribute(
     every = hypotheses = tuple(hypotheses)
     p_value = p_detected = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
-    loud = p_value < level and baseline.chi2_per_dof > DETECTION_EXCESS
+    clear = p_value < level and (baseline.chi2_per_dof > DETECTION_EXCESS or np.any(loud(baseline)))
     current, rounds, unknown, count, looped = baseline, [], False, 0, None
     while count < max_causes and not workers.late:
         if settled(current) and looped is not current:
             # Along the record noise is taken large, and hides other causes.
             current = looped = as_loops(problem, current, workers)
         told = baseline.costs - current.costs
-        asked, faint = hypotheses, not loud or settled(less_errors_of_laws(current, told))
+        quiet_as_a_whole = settled(less_errors_of_laws(current, told)) and not np.any(loud(current, told))
+        asked, faint = hypotheses, not clear or quiet_as_a_whole
         if faint:
             workers.say("what the noise as a whole would hide")
             asked, by_chance = hidden(problem, current, hypotheses, told)
             if not asked:
                 break
-            p_detected = p_detected if loud or rounds else by_chance
+            p_detected = p_detected if clear or rounds else by_chance
         workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
         # What is left beside a cause is mostly what its law lacks, and no hinge unless little is left; what is faint shows none everywhere.
         bare = np.inf if rounds or faint else worth_a_hinge(current)
@@ -159,7 +160,7 @@ def attribute(
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
-    return Attribution(baseline, loud or bool(kept), p_detected if kept else p_value, kept, current, unknown)
+    return Attribution(baseline, clear or bool(kept), p_detected if kept else p_value, kept, current, unknown)
 
 
 def less_errors_of_laws(current: Fit, told: np.ndarray) -> Fit:

@@ -14,12 +14,17 @@ from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
 
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom up to which the estimate of the noise may be short of it
+JOINT_EXCESS = 1.25  # the same of a single joint
+JOINT_CHANCE = 4.0  # standard deviations of that by chance, which few data leave
+ERROR_OF_LAWS = 0.01  # of what causes explain at a joint, left there by errors of their laws
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
 DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive among the parameters
 ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
 LAST_STEPS = 8  # at most, under the noise that the baseline sees itself
+RENEWALS = 3  # at most, of that noise
+SAME_NOISE = 0.05  # natural logarithm of a drive figure, up to which a fit has moved so little that its noise is its own
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 
 
@@ -61,10 +66,14 @@ def fit_baseline(
         if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
             best = other
     # Its weights are those of a model on the way, which passes on another noise.
-    try:
-        best = fit(problem, best.model, iterations=LAST_STEPS, remainders=best.remainders, progress=progress)
-    except NOT_COMPUTED:
-        pass  # drives gone astray pass on noise without bounds
+    for _ in range(RENEWALS):
+        on_the_way = best.model.par.to_log()
+        try:
+            best = fit(problem, best.model, iterations=LAST_STEPS, remainders=best.remainders, progress=progress)
+        except NOT_COMPUTED:
+            break  # drives gone astray pass on noise without bounds
+        if np.max(np.abs(best.model.par.to_log() - on_the_way)) < SAME_NOISE:
+            break
     return replace(best, softer=first.softer)
 
 
@@ -81,9 +90,30 @@ def astray(problem: Problem, result: Fit) -> np.ndarray:
 
 
 def discrepancy_p_value(result: Fit) -> float:
-    """Probability of a cost this large by noise alone (chi-square, Wilson-Hilferty in the tail)."""
+    """Probability of a cost this large by noise alone: of all joints, or of the clearest of those that are ``loud`` (Bonferroni).
+
+    By chi-square (Wilson-Hilferty in the tail).
+    """
     dof = max(result.count - len(result.names), 1)
-    return float(scipy.stats.chi2.sf(result.cost, dof))
+    whole = float(scipy.stats.chi2.sf(result.cost, dof))
+    at = loud(result)
+    if not np.any(at):
+        return whole
+    each = scipy.stats.chi2.sf(result.costs[at], np.maximum(result.counts[at], 1.0))
+    return min(whole, float(len(at) * np.min(each)))
+
+
+def loud(result: Fit, told: np.ndarray | float = 0.0) -> np.ndarray:
+    """(n,) whether a joint alone leaves clearly more than noise, which all joints together may hide.
+
+    The noise of one joint is known less well than that of all, and laws of causes that are named leave more at their own.
+
+    Args:
+        told: (n,) fall of the cost by joint that causes have brought.
+    """
+    by_chance = JOINT_EXCESS - 1.0 + JOINT_CHANCE * np.sqrt(2.0 / np.maximum(result.counts, 1.0))
+    by_laws = ERROR_OF_LAWS * np.maximum(told, 0.0)
+    return result.costs - result.counts > np.maximum(by_chance * result.counts, by_laws)
 
 
 def implausible(problem: Problem, result: Fit, joints: Sequence[int] | None = None) -> bool:

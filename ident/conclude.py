@@ -266,7 +266,8 @@ def _cause(
     effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float
 ) -> Cause:
     h = effect.hypothesis
-    same = [c for c in candidates if c.hypothesis.effect == h.effect and c.hypothesis.place == h.place]
+    joints = h.options.get("joints", ())
+    same = [c for c in candidates if c.hypothesis.key == h.key and c.hypothesis.options.get("joints", ()) == joints]
     own = sum(c.probability for c in same) if candidates else 1.0
     others: dict[tuple[str, str], float] = {}
     for c in candidates:
@@ -275,7 +276,6 @@ def _cause(
             others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
     parameters = reported_parameters(effect, final, covariance)
     numbers = {k: v.value for k, v in parameters.items()}
-    joints = h.options.get("joints", ())
     return Cause(
         effect=h.effect,
         joint=h.place,

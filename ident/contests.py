@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from ident.evidence import Candidate, model_error, weigh
+from ident.evidence import Candidate, errors_by_joint, weigh
 from ident.hypotheses import Hypothesis, catalogue
 from ident.hypotheses.bodies import payload, payload_like
 from ident.model import Effect
@@ -88,8 +88,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     for c in sorted(ran, key=lambda c: c.fit.cost):
         best_of.setdefault(c.hypothesis.key, c)
     ran = [c for c in best_of.values() if c.hypothesis is own.hypothesis or not same_as_special(c, best_of)]
-    excess = model_error(min(c.fit.cost for c in ran), current.count, found.fall)
-    weighed = weigh(ran, excess, temper_of(found.before))
+    excess = errors_by_joint(min((c.fit for c in ran), key=lambda r: r.cost).costs, current.counts, found.fall)
+    weighed = weigh(ran, excess, found.falls, temper_of(found.before))
     best = weighed[0]
     if best.hypothesis.decoy:  # it takes probability from the name, and no place in the model
         best = next(c for c in weighed if c.hypothesis.key == own.hypothesis.key)

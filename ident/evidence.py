@@ -54,8 +54,8 @@ def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
 
 def rivals_of_best(
     before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
-) -> tuple[list[tuple[Hypothesis, Fit]], float]:
-    """Candidates that explain some of what the best one does, and the excess over noise that they leave there.
+) -> tuple[list[tuple[Hypothesis, Fit]], np.ndarray]:
+    """Candidates that explain some of what the best one does, and the excess over noise by joint that counts as an error of theirs.
 
     A real arm has causes at every joint: one that explains another joint is no alternative, and what is left
     there is no error of this one. A change of the chain is seen at every joint.
@@ -65,10 +65,24 @@ def rivals_of_best(
     falls = before.costs - top.costs
     at = int(np.argmax(falls))
     if best.on_chain or falls[at] <= 0.0:
-        return ranked, model_error(top.cost, before.count, float(np.sum(falls)))
+        return ranked, errors_by_joint(top.costs, before.counts, float(np.sum(falls)))
     kept = [(h, r) for h, r in ranked if before.costs[at] - r.costs[at] >= RIVAL * falls[at]]
-    left = min(r.costs[at] for _, r in kept)
-    return kept, model_error(float(left), float(before.counts[at]), float(falls[at]))
+    left = top.costs.copy()
+    left[at] = min(r.costs[at] for _, r in kept)
+    return kept, errors_by_joint(left, before.counts, float(falls[at]))
+
+
+def errors_by_joint(left: np.ndarray, counts: np.ndarray, fall: float) -> np.ndarray:
+    """(n,) ``model_error`` of each joint, and at all of them a share of what is clearly left anywhere.
+
+    What another cause leaves at its own joint blurs what candidates do there, and next to nothing of what they do elsewhere.
+
+    Args:
+        left: (n,) costs that the best candidate leaves, of ``counts`` data.
+    """
+    above = float(np.sum(np.maximum(left - DETECTION_EXCESS * counts, 0.0)))
+    own = [model_error(x, k, fall) for x, k in zip(left, counts, strict=True)]
+    return np.array(own) + LAW_ERROR * above
 
 
 def model_error(left: float, count: float, fall: float) -> float:
@@ -86,23 +100,27 @@ def model_error(left: float, count: float, fall: float) -> float:
     return above + (min(within, LAW_ERROR * fall) if fall > 0.0 else within)
 
 
-def weigh(candidates: Sequence[Candidate], excess: float, temper: float = TEMPER) -> list[Candidate]:
+def weigh(candidates: Sequence[Candidate], excess: np.ndarray, falls: np.ndarray, temper: float = TEMPER) -> list[Candidate]:
     """Probabilities of refitted hypotheses, best first.
 
     Under pure noise the evidence is half the difference of the costs. What the best model leaves
     above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
-    difference counts only against ``temper + MODEL_ERROR_SHARE x excess``. Parameters count by how far
-    the data narrow them down (``occam``).
+    difference at a joint counts only against ``temper + MODEL_ERROR_SHARE x excess`` there. Parameters count by how far
+    the data narrow them down (``occam``), at the joints where the effect is seen.
 
     Args:
-        excess: cost beyond noise that the best of them leaves.
+        excess: (n,) cost beyond noise by joint that the best of them leaves (``errors_by_joint``).
+        falls: (n,) of the costs by joint, by the best of them.
         temper: what differences are divided by without that.
     """
-    cost = np.array([c.fit.cost for c in candidates])
+    costs = np.array([c.fit.costs for c in candidates])
     decoy = np.array([c.hypothesis.decoy for c in candidates], float)
-    temper = temper + MODEL_ERROR_SHARE / 6.0 * excess
-    evidence = -0.5 * (cost - cost.min()) / temper - DECOY_NATS * decoy
-    evidence += [occam(c, temper) + c.hypothesis.options.get("nats", 0.0) for c in candidates]
+    tempers = temper + MODEL_ERROR_SHARE / 6.0 * excess
+    where = np.maximum(falls, 0.0)
+    where = where / np.sum(where) if np.any(where) else np.full(len(falls), 1.0 / len(falls))
+    evidence = -0.5 * np.sum((costs - costs[np.argmin(np.sum(costs, axis=1))]) / tempers, axis=1) - DECOY_NATS * decoy
+    seen = 1.0 / float(np.sum(where / tempers))
+    evidence += [occam(c, seen) + c.hypothesis.options.get("nats", 0.0) for c in candidates]
     evidence -= evidence.max()
     probability = np.exp(evidence) / np.exp(evidence).sum()
     out = [

@@ -50,7 +50,12 @@ class Round:
     @property
     def fall(self) -> float:
         """Of the cost, by the winner."""
-        return self.before.cost - self.candidates[0].fit.cost
+        return float(np.sum(self.falls))
+
+    @property
+    def falls(self) -> np.ndarray:
+        """(n,) the same by joint."""
+        return self.before.costs - self.candidates[0].fit.costs
 
 
 def left_share(baseline: Fit, current: Fit) -> float:
@@ -198,7 +203,8 @@ def weighed_round(
     if not ranked:
         return Round(before, (), tuple(scores), 1.0, 0.0)
     rivals, excess = rivals_of_best(before, ranked)
-    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess, temper_of(before))
+    falls = before.costs - min(ranked, key=lambda x: x[1].cost)[1].costs
+    weighed = weigh([Candidate(h, result, 0.0) for h, result in rivals], excess, falls, temper_of(before))
     scale = max(1.0, min(r.cost for _, r in ranked) / before.count)
     noise = DETECTION_EXCESS if before.chi2_per_dof <= DETECTION_EXCESS else 1.0
     share = max(explained(before, weighed[0].fit, noise), softly.get(weighed[0].hypothesis.key, 0.0))

@@ -225,9 +225,12 @@ def test_faint_candidates_are_told_apart_by_what_they_explain(hypotheses):
         model = SimpleNamespace(
             effects=(SimpleNamespace(hypothesis=h, p=np.array([1e-4])),), par=SimpleNamespace(stiffness=np.ones(6))
         )
-        return Candidate(h, SimpleNamespace(model=model, information=np.eye(4), cost=cost), 0.0)
+        return Candidate(h, SimpleNamespace(model=model, information=np.eye(4), costs=np.array([cost])), 0.0)
 
-    faint, of_all = (weigh([one(17900.0), one(18000.0)], x)[0].probability for x in (model_error(17900.0, 17550.0, 600.0), 350.0))
+    faint, of_all = (
+        weigh([one(17900.0), one(18000.0)], np.array([x]), np.array([600.0]))[0].probability
+        for x in (model_error(17900.0, 17550.0, 600.0), 350.0)
+    )
     assert faint == pytest.approx(1.0 / (1.0 + np.exp(-50.0 / (TEMPER + 0.3))), abs=1e-9)
     assert of_all < 0.95
 
@@ -236,9 +239,9 @@ def test_beside_noise_alone_differences_count_for_more(hypotheses):
     """No law has an error there that neighbouring lines could share."""
     h = next(h for h in hypotheses if h.effect == "torque_delay")
     model = SimpleNamespace(effects=(SimpleNamespace(hypothesis=h, p=np.array([1e-4])),), par=SimpleNamespace(stiffness=np.ones(6)))
-    two = [Candidate(h, SimpleNamespace(model=model, information=np.eye(4), cost=cost), 0.0) for cost in (1000.0, 1012.0)]
+    two = [Candidate(h, SimpleNamespace(model=model, information=np.eye(4), costs=np.array([cost])), 0.0) for cost in (1000.0, 1012.0)]
     for temper in (TEMPER, TEMPER_OF_NOISE):
-        assert weigh(two, 0.0, temper)[0].probability == pytest.approx(1.0 / (1.0 + np.exp(-6.0 / temper)), abs=1e-9)
+        assert weigh(two, np.zeros(1), np.ones(1), temper)[0].probability == pytest.approx(1.0 / (1.0 + np.exp(-6.0 / temper)), abs=1e-9)
 
 
 def test_a_round_within_the_noise_is_weighed_so(identified, hypotheses):

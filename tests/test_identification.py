@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.baseline import discrepancy_p_value
+from ident.baseline import discrepancy_p_value, fit_baseline
 from ident.chain import build_structure
 from ident.coordinates import pack, unpack
 from ident.costs import joint_costs
@@ -20,6 +20,7 @@ from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.model import Effect, Model
 from ident.problem import output_error, predictions
+from ident.refits import reweighted
 from ident.screening import screen
 from ident.torque_fit import SLIGHT, fit
 from ident.weights import make_weights
@@ -50,6 +51,19 @@ def test_the_true_drives_are_found_with_honest_intervals(clean, identified):
     assert np.abs(error[6:12]).max() < 0.05 and np.abs(error[18:]).max() < 0.05
     assert np.mean(np.abs(error) < 1.96 * std) >= 0.75
     assert 0.8 < result.chi2_per_dof < 1.25
+
+
+def test_the_last_fit_is_under_the_noise_of_its_own_model(identified, monkeypatch):
+    """Motors that begin at a tenth of their inertia pass on a tenth of the noise of the positions."""
+    setup, right = identified
+    problem = setup.problem
+    par = replace(right.model.par, inertia=0.1 * right.model.par.inertia)
+    lost = replace(right, model=replace(right.model, par=par), costs=1e6 * right.costs)
+    monkeypatch.setattr("ident.baseline.anneal", lambda *args, **options: lost)
+    found = fit_baseline(problem)
+    own = make_weights(problem, predictions(problem, found.model, found.remainders), 0.0)
+    assert reweighted(problem, found, own).costs == pytest.approx(found.costs, rel=0.02)
+    assert found.model.par.inertia == pytest.approx(right.model.par.inertia, rel=0.01)
 
 
 def test_held_out_data_are_predicted_to_the_noise(clean, identified):

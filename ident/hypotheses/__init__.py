@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from ident.chain import Structure
@@ -56,8 +58,8 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
             out.append(sensing.constant_torque(j, name))
         if robot.joints[j].gear_ratio != 1.0:
             out.append(sensing.encoder_eccentricity(j, name, robot.joints[j].gear_ratio))
-    for j in range(len(names) - 1):
-        out.append(structure.joint_coupling(j, j + 1, names[j], names[j + 1]))
+    for j, k in itertools.permutations(range(len(names)), 2):
+        out.append(structure.joint_coupling(j, k, names[j], names[k]))
     if robot.payload_link in chain.bodies:
         out.append(bodies.payload(robot.payload_link))
     seen: set[int] = set()

@@ -224,7 +224,7 @@ NATIVE = {
     "hysteresis": "springs slip:{index}, which yield",
     "gravity_spring": "spring of link:{place}",
     "dress_pack": "spring and frictionloss of link:{place}",
-    "joint_coupling": "motor:{place} in the gear of the next joint",
+    "joint_coupling": "motor:{place} in the gear of the joint that it turns too",
     "payload": "inertia of the last body",
     "link_inertia": "inertia of the body",
     "transverse_elasticity": "hinge elasticity:{effect}:{place}:{index}",
@@ -246,11 +246,12 @@ def _note_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
 
 
 def _couplings(robot: Robot, causes: Sequence[Cause]) -> dict[tuple[str, str], float]:
-    """(motor, next joint) -> ratio; a tendon takes a joint once."""
+    """(motor, joint that it turns too) -> ratio; a tendon takes a joint once. The next joint where a cause does not say which."""
     out: dict[tuple[str, str], float] = {}
     for c in causes:
         if c.effect == "joint_coupling":
-            pair = (c.joint, robot.joint_names[robot.joint_names.index(c.joint) + 1])
+            turned = c.joints[-1] if c.joints else robot.joint_names[robot.joint_names.index(c.joint) + 1]
+            pair = (c.joint, turned)
             out[pair] = out.get(pair, 0.0) + c.parameters["ratio"].value
     return out
 
