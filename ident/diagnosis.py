@@ -19,7 +19,7 @@ from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import Parameters
 from ident.group import Group
 from ident.hypotheses.sensing import torque_offset
-from ident.identification import RUNAWAY, Setup, identify, set_up, under_noise_that_is_left, with_held_out
+from ident.identification import RUNAWAY, Setup, identify, set_up, under_noise_beside_causes, with_held_out
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
 from ident.next_experiment import separating_experiment
@@ -200,7 +200,7 @@ def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, worke
     """Causes of what the baseline leaves, sought again where beside them the noise turns out to be far less than was guessed."""
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     try:
-        other, first = under_noise_that_is_left(dataset, setup, result.final)
+        other, first = under_noise_beside_causes(dataset, setup, result.final)
     except NOT_COMPUTED:
         return setup, baseline, result
     if other is setup or workers.late:

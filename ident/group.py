@@ -42,6 +42,8 @@ class Group:
         rest: (S, n_time, n) where motors stand still, or turn.
         Q_fast: (S, F, n) mean spectra of the position beyond lines 0..L-1, as far as they are signal and the time grid reaches;
             None of a motion.
+        noise_spacing, U_noise, Q_noise: (S, J, n) spectra of noise alone, every so many lines of the period, where a single
+            period has no scatter (``ends_of_transients``); or None.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -70,6 +72,14 @@ class Group:
     link_std: np.ndarray | None = None
     links: tuple[int, ...] = ()
     n_slow: int | None = None
+    noise_spacing: int = 1
+    U_noise: np.ndarray | None = None
+    Q_noise: np.ndarray | None = None
+
+    @property
+    def shows_noise(self) -> bool:
+        """Whether its noise is measured: by the scatter between periods, or by the end of the transient before a single one."""
+        return self.window is None and (self.U_periods.shape[1] > 1 or self.U_noise is not None)
 
     @property
     def outputs(self) -> np.ndarray:
@@ -171,7 +181,7 @@ class Group:
 
     def pick(self, rows: np.ndarray) -> Group:
         """The group with some of its segments."""
-        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods", "rest", "Q_fast")
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods", "rest", "Q_fast", "U_noise", "Q_noise")
         parts = {name: getattr(self, name) for name in names}
         kept = {name: None if x is None else x[rows] for name, x in parts.items()}
         return replace(self, segments=tuple(self.segments[i] for i in rows), **kept)

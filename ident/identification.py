@@ -20,8 +20,10 @@ from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps
 from ident.records import build_groups
+from ident.refits import reweighted
 from ident.rest import difference_noise
 from ident.torque_fit import Fit
+from ident.weights import make_weights
 from robot_assets.errors import DataError
 
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
@@ -179,12 +181,12 @@ def whitened(problem: Problem, result: Fit, found: Sequence[Prediction]) -> list
 def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
     """Sample noise that was guessed, raised to what lines show that nothing excites, where periods show no scatter."""
     guessed = guessed_noise(dataset)
-    single = all(g.window is None and g.U_periods.shape[1] == 1 for g in problem.groups)
-    if not single or not any(guessed) or result.chi2_per_dof <= DETECTION_EXCESS:
+    unknown = all(g.window is None and not g.shows_noise for g in problem.groups)
+    if not unknown or not any(guessed) or result.chi2_per_dof <= DETECTION_EXCESS:
         return problem
     found = predictions(problem, result.model, result.remainders)
     factor = np.sqrt(unexcited_noise(problem.groups, whitened(problem, result, found)))
-    q_std, tau_std = (std * factor if unknown else std for std, unknown in zip((problem.q_std, problem.tau_std), guessed, strict=True))
+    q_std, tau_std = (std * factor if guess else std for std, guess in zip((problem.q_std, problem.tau_std), guessed, strict=True))
     return replace(problem, q_std=q_std, tau_std=tau_std) if factor > 1.0 else problem
 
 
@@ -205,6 +207,31 @@ def under_noise_that_is_left(
     return setup, first
 
 
+def under_noise_beside_causes(
+    dataset: Dataset, setup: Setup, result: Fit, progress: Callable[[str], None] | None = None
+) -> tuple[Setup, Fit]:
+    """The same beside the causes that ``result`` has: of noise that was raised to what lines show that nothing excites, no more than is left.
+
+    A ripple of the gear shows at those lines as at the others, and looks like noise as long as it is missing.
+    """
+    problem, first = setup.problem, result
+    q_std, tau_std = _noise(dataset)
+    raised = np.any(problem.q_std > q_std) and not any(g.shows_noise for g in problem.groups)
+    if raised and guessed_noise(dataset)[0]:
+        guess = replace(problem, q_std=np.minimum(problem.q_std, q_std), tau_std=np.minimum(problem.tau_std, tau_std))
+        calmer = with_noise_of_unexcited_lines(dataset, guess, under_noise_of(guess, result))
+        if np.all(LOUD * calmer.q_std**2 < problem.q_std**2):
+            setup, result = replace(setup, problem=calmer), under_noise_of(calmer, result)
+            first = fit_baseline(calmer, progress)
+    other, lowered = under_noise_that_is_left(dataset, setup, result, progress)
+    return other, first if other is setup else lowered
+
+
+def under_noise_of(problem: Problem, result: Fit) -> Fit:
+    """A fit as it stands, its cost under the noise of a problem."""
+    return reweighted(problem, result, make_weights(problem, predictions(problem, result.model, result.remainders), 0.0))
+
+
 def guessed_noise(dataset: Dataset) -> list[bool]:
     """Whether the noise of position and of torque are not given."""
     return [not (given is not None and np.all(given > 0)) for given in (dataset.q_std, dataset.tau_std)]
@@ -216,7 +243,7 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
     Differences of samples tell what circulates in the loop too: a differentiating controller makes of the noise of the encoder
     ten times that of the torque sensor and more, which cancels in the torque residual.
     """
-    if not guessed_noise(dataset)[1] or any(g.window is None and g.U_periods.shape[1] > 1 for g in problem.groups):
+    if not guessed_noise(dataset)[1] or any(g.shows_noise for g in problem.groups):
         return problem
     n, left, shares = problem.structure.n, [], []
     found = predictions(problem, result.model, result.remainders)

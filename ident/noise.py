@@ -11,12 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.optimize
 
 from ident.group import Group, mean_over_lines
+from ident.transients import LEAKED
 
 PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
+WINDOWED = 2.0  # neighbouring lines of a spectrum through a window, that count as one
+LEVEL_STEPS = 60
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
 DOUBT = 1.5  # of the power of noise, by which what such lines hold may be too little
@@ -58,63 +60,77 @@ def residual_covariance(
     The shape over frequency is that of white channel noise carried by ``Z``; the scatter between
     periods sets its size, and corrects its shape by a smooth matrix where there is enough of it.
     """
-    P = group.U_periods.shape[1]
-    if P < 2:
+    found = _scatter(group, Z)
+    if found is None:
         S = white_covariance(Z, tau_std**2 / samples, q_std**2 / samples)
         return S[: group.n_compared]
-    e = group.U_periods - np.einsum("lij,splj->spli", Z, group.Q_periods, optimize=True)
-    d = (e - e.mean(axis=1, keepdims=True))[:, :, : group.n_compared]
-    scale = e.shape[0] * (P - 1) * P
+    d, lines, dof_line = found
     Zk = Z[: group.n_compared]
-    power = np.einsum("spki->ki", np.abs(d) ** 2) / scale
-    tau_var, q_var = _white_levels(power, Zk)
+    tau_var, q_var = _white_levels(np.sum(np.abs(d) ** 2, axis=0), Zk[lines])
     S = white_covariance(Zk, tau_var, q_var)
     root = np.linalg.cholesky(S)
-    white = np.linalg.solve(root[None, None], d[..., None])[..., 0]
-    scatter = np.einsum("spki,spkj->kij", white, white.conj(), optimize=True) / scale
-    dof_line = e.shape[0] * (P - 1)
+    white = np.linalg.solve(root[lines][None], d[..., None])[..., 0]
+    scatter = np.einsum("ski,skj->kij", white, white.conj(), optimize=True)
     half = int(np.ceil(0.5 * SMOOTH_DOF / dof_line))
     smooth, count = _moving_mean(scatter, half)
     dof = (count * dof_line)[:, None, None]
     shape = (dof * smooth + PRIOR_DOF * np.eye(Z.shape[1])) / (dof + PRIOR_DOF)
+    shape = shape[np.abs(lines[None, :] - np.arange(len(Zk))[:, None]).argmin(axis=1)]
     return root @ shape @ np.conj(np.swapaxes(root, 1, 2))
+
+
+def _scatter(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """What noise alone makes of the torque residual: (R, J, n) of which the sum of squares is the variance of the mean.
+
+    With the lines (J,) of the period that it stands at, and its degrees of freedom per line. By what periods differ by, or the
+    end of a transient one and a single steady one; None where there is neither.
+    """
+    P = group.U_periods.shape[1]
+    if P > 1:
+        e = group.U_periods - np.einsum("lij,splj->spli", Z, group.Q_periods, optimize=True)
+        d = (e - e.mean(axis=1, keepdims=True))[:, :, : group.n_compared]
+        scale = len(e) * (P - 1) * P
+        return d.reshape(-1, *d.shape[2:]) / np.sqrt(scale), np.arange(group.n_compared), float(len(e) * (P - 1))
+    if group.U_noise is None:
+        return None
+    lines = group.noise_spacing * np.arange(LEAKED, group.U_noise.shape[1])
+    d = group.U_noise[:, LEAKED:] - np.einsum("lij,slj->sli", Z[lines], group.Q_noise[:, LEAKED:], optimize=True)
+    return d / np.sqrt(len(d)), lines, len(d) / WINDOWED
 
 
 def sample_noise(group: Group, Z: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Standard deviation of white noise on torque and position samples, (n,) each.
 
-    From the scatter of the torque residual between periods; None where there is one period.
+    From what shows the noise of the torque residual alone (``_scatter``); None where nothing does.
     """
-    P = group.U_periods.shape[1]
-    if P < 2:
+    found = _scatter(group, Z)
+    if found is None:
         return None
-    e = group.U_periods - np.einsum("lij,splj->spli", Z, group.Q_periods, optimize=True)
-    d = (e - e.mean(axis=1, keepdims=True))[:, :, : group.n_compared]
-    power = np.einsum("spki->ki", np.abs(d) ** 2) / (e.shape[0] * (P - 1))
-    tau_var, q_var = _white_levels(power, Z[: group.n_compared])
+    d, lines, _ = found
+    power = group.U_periods.shape[1] * np.sum(np.abs(d) ** 2, axis=0)
+    tau_var, q_var = _white_levels(power, Z[lines])
     return np.sqrt(tau_var * samples), np.sqrt(q_var * samples)
 
 
 def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Non-negative channel variances that explain the line power (K, n) of the residual."""
-    n = power.shape[1]
-    gain = np.abs(Z) ** 2
-    columns = np.zeros((power.shape[0], n, 2 * n))
-    k = np.arange(n)
+    """Channel variances, (n,) each, that are likeliest of the line power (K, n) of the residual.
+
+    Powers of lines of noise are exponential about their mean ``m``: ``sum(log m + power / m)`` is least (Whittle 1953), by
+    multiplicative steps, under which variances stay positive (Fevotte, Bertin and Durrieu, Neural Comput. 21, 2009, eq. 4.7).
+    """
+    n, k = power.shape[1], np.arange(power.shape[1])
+    columns = np.zeros((len(power), n, 2 * n))
     columns[:, k, k] = 1.0
-    columns[:, :, n:] = gain
+    columns[:, :, n:] = np.abs(Z) ** 2
     floor = 1e-12 * np.maximum(power.mean(axis=0), 1e-300)
-    # Relative errors count: the first weights are those of a running mean, the next of the model.
-    local = _moving_mean(power[:, :, None], 15)[0][:, :, 0]
-    weight = 1.0 / np.maximum(local, floor + 1e-300)
-    level = np.zeros(2 * n)
-    for _ in range(4):
-        A = (columns * weight[..., None])[1:].reshape(-1, 2 * n)
-        b = (power * weight)[1:].ravel()
-        size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-        level = scipy.optimize.nnls(A / size, b)[0] / size
-        model = columns @ level + floor
-        weight = 1.0 / np.maximum(model, 0.1 * local)
+    A = columns[1:].reshape(-1, 2 * n)
+    b = np.maximum(power, floor)[1:].ravel()
+    own = np.maximum(np.diagonal(columns[1:, :, n:], axis1=1, axis2=2), 1e-300)
+    level = np.concatenate([np.median(power[1:], axis=0), np.median(power[1:] / own, axis=0)])
+    level = np.maximum(level, 1e-300)
+    for _ in range(LEVEL_STEPS):
+        inverse = 1.0 / (A @ level + 1e-300)
+        level = level * (A.T @ (b * inverse**2)) / np.maximum(A.T @ inverse, 1e-300)
     return level[:n] + floor, level[n:] + 1e-12 * floor
 
 

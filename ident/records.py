@@ -18,6 +18,7 @@ from ident.closing import close_motion
 from ident.dataset import Dataset, Segment
 from ident.group import Group, signal_power
 from ident.rest import REST_TIME, at_rest, at_rest_in_period, difference_noise, lasting, slow, turning
+from ident.transients import ends_of_transients
 from robot_assets.errors import DataError
 
 RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: what still rings then has decayed
@@ -115,6 +116,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
     white_noise = np.mean([difference_noise(s.q) ** 2 for s in members], axis=0) / N
     fast = np.stack([_lines(x, min(N // 2, (n_time + 1) // 2))[:, n_lines:] for x in q])
     at = np.arange(n_time) * N // n_time
+    spacing, *noise = ends_of_transients(members, top) or (1, None, None)
     group = Group(
         operating_point=str(first.operating_point),
         segments=tuple(s.name for s in members),
@@ -137,6 +139,9 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
         white_torque_noise=np.mean([difference_noise(s.tau) ** 2 for s in members], axis=0) / N,
         Q_fast=signal_power(fast, white_noise),
         rest=np.stack([at_rest_in_period(x, fs, 0.5 * N / fs / n_lines)[at] for x in q]),
+        noise_spacing=spacing,
+        U_noise=noise[0],
+        Q_noise=noise[1],
     )
     return replace(group, rest=group.rest | turning(group))
 

@@ -20,15 +20,16 @@ from ident.evidence import (
 )
 from ident.hypotheses import Hypothesis
 from ident.parallel import Workers
-from ident.problem import Problem
+from ident.problem import Problem, predictions
 from ident.refits import FAINT, FINALISTS, left_by, refit, reweighted, settled, under_own_noise
-from ident.screening import Score
+from ident.screening import Score, screen
 from ident.search import MIN_SHARE, STRONG, explore, explore_softly, under_noise_of_best
 from ident.strong import beside_strong
 from ident.torque_fit import Fit
 
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
+NEXT_LEAVES = 0.1  # of what the best candidate leaves, that a linear step of another cause may leave of it
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 
@@ -127,7 +128,8 @@ def attribute_once(
     ranked = sorted(best.values(), key=lambda x: x[1].cost)
     if ranked:
         before, ranked = under_noise_of_best(problem, before, ranked, workers)
-    if leaves_much(problem, before, ranked) and not told and not workers.late:
+    left = leaves_much(problem, before, ranked) and not told and not workers.late
+    if left and not (ranked and next_answers(problem, before, *ranked[0], hypotheses)):
         before, ranked = beside_strong(problem, before, ranked, scores, workers, quiet)
     return weighed_round(before, ranked, scores, softly)
 
@@ -139,10 +141,28 @@ def leaves_much(problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis
     motions under the law of the best; else more than what is faint, and than errors of its law.
     """
     bent = bool(ranked) and "bends" in ranked[0][0].options
+    return min(before.cost - before.count, left_by(ranked)) > allowed_to_stay(problem, before, bent)
+
+
+def allowed_to_stay(problem: Problem, before: Fit, bent: bool) -> float:
+    """Excess over noise that the best candidate may leave with no strong effect missing; ``bent``: by its law the arm may have
+    several steady motions."""
     spoilt = not problem.motions_alone and (bent or implausible(problem, before))
-    excess = before.cost - before.count
-    allowed = SPOILT * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * excess)
-    return min(excess, left_by(ranked)) > allowed
+    return SPOILT * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * (before.cost - before.count))
+
+
+def next_answers(problem: Problem, before: Fit, best: Hypothesis, result: Fit, hypotheses: Sequence[Hypothesis]) -> bool:
+    """Whether a linear step of another hypothesis explains what the best candidate leaves: that is then another cause, and none strong.
+
+    Of two causes the first to be named leaves the second, which the next round finds; strong effects show little in linear steps.
+    """
+    if "bends" in best.options or best.decoy:
+        return False
+    others = [h for h in hypotheses if h.key != best.key and not h.decoy]
+    scores = screen(problem, result, predictions(problem, result.model, result.remainders), others)
+    excess = result.cost - result.count
+    gain = next((s.gain for s in scores if s.start is not None), 0.0)
+    return excess - gain <= max(allowed_to_stay(problem, before, False), NEXT_LEAVES * excess)
 
 
 def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozenset[int]:

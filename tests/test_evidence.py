@@ -17,7 +17,18 @@ from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose, harmful, left_over
-from ident.evidence import ABSENT, LAW_ERROR, POINTLESS_NATS, TEMPER, Candidate, errors_by_joint, explained, occam, pointless, weigh
+from ident.evidence import (
+    ABSENT,
+    LAW_ERROR,
+    POINTLESS_NATS,
+    TEMPER,
+    Candidate,
+    errors_by_joint,
+    explained,
+    occam,
+    pointless,
+    weigh,
+)
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
 from ident.hypotheses.bodies import payload, payload_like

@@ -7,8 +7,11 @@ import pytest
 
 from ident.baseline import fit_baseline
 from ident.diagnosis import diagnose
-from ident.identification import identify, set_up, with_noise_that_is_left
+from ident.identification import identify, set_up, under_noise_beside_causes, with_noise_that_is_left
 from ident.noise import DOUBT, torque_noise_left
+from ident.problem import predictions
+from ident.refits import reweighted
+from ident.weights import make_weights
 from sim import parse_effect, run_experiment
 from tests.conftest import small_plan, through_files
 
@@ -92,8 +95,31 @@ def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints
     """One period of a multisine: noise of the positions is correlated over the torques of the joints, and most of it at high lines."""
     plan = small_plan(ur10, 32, points=2, periods=2, transient_periods=1)
     data = replace(through_files(run_experiment(plan, seed=32), tmp_path_factory.mktemp("one")), q_std=None, tau_std=None)
+    last = [replace(s, periods=1, transient_periods=0, **s.part(slice(-s.period, None))) for s in data.segments]
+    data = replace(data, segments=tuple(last))  # the transient tells it otherwise
     true = ur10.array("tau_std")
     problem = replace(set_up(data).problem, tau_std=10.0 * true)
     found = with_noise_that_is_left(data, problem, fit_baseline(problem)).tau_std
     assert np.all(found > 0.8 * true)
     assert np.all(found < 2.5 * true)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tmp_path_factory, monkeypatch, coloured):
+    """A ripple shows at lines that nothing excites as at the others; what is still left there beside it is noise."""
+    plan = small_plan(ur10, 35, points=2, periods=2, transient_periods=1)
+    data = replace(through_files(run_experiment(plan, seed=35), tmp_path_factory.mktemp("raised")), q_std=None, tau_std=None)
+    last = [replace(s, periods=1, transient_periods=0, **s.part(slice(-s.period, None))) for s in data.segments]
+    data = replace(data, segments=tuple(last))
+    setup, told = identify(data)  # the model with what was found
+    guess = set_up(data).problem
+    raised = replace(setup.problem, q_std=3.0 * guess.q_std, tau_std=3.0 * guess.tau_std)
+    if coloured:
+        told = replace(told, costs=2.0 * told.counts)
+        monkeypatch.setattr("ident.identification.under_noise_of", lambda problem, result: result)
+        monkeypatch.setattr("ident.identification.unexcited_noise", lambda groups, whitened: 9.0)
+    other, first = under_noise_beside_causes(data, replace(setup, problem=raised), told)
+    assert other.problem.q_std == pytest.approx((3.0 if coloured else 1.0) * guess.q_std)
+    if not coloured:
+        own = make_weights(other.problem, predictions(other.problem, first.model, first.remainders), 0.0)
+        assert reweighted(other.problem, first, own).costs == pytest.approx(first.costs, rel=0.02)

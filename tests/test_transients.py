@@ -1,0 +1,117 @@
+"""Noise of records with one steady period, by the end of the transient before it."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ident.identification import identify, set_up
+from ident.noise import LEVEL_STEPS, _white_levels
+from ident.transients import ends_of_transients
+
+PERIOD, TOP, STD = 4000, 300, 2e-3
+
+
+def record(seed, *, decay=0.0, steady=1, transient=1, period=PERIOD):
+    """A steady motion, a transient of a time constant of ``decay`` periods beside it, and white noise; of two joints."""
+    rng = np.random.default_rng(seed)
+    t = np.arange((steady + transient) * period) / period
+    motion = np.sum([np.sin(2 * np.pi * k * t + k * k) for k in range(1, 40, 2)], axis=0)
+    dying = 5.0 * np.exp(-t / decay) * np.sin(2 * np.pi * 47.3 * t) if decay else 0.0
+    x = (motion + dying)[:, None] + STD * rng.normal(size=(len(t), 2))
+    return SimpleNamespace(
+        tau=x, q=1e-3 * x, period=period, periods=steady + transient, transient_periods=transient, steady_periods=steady
+    )
+
+
+@pytest.mark.parametrize(("decay", "spacing"), [(0.0, 2), (0.03, 2), (0.08, 4)])
+@pytest.mark.parametrize("period", [PERIOD, PERIOD + 1])
+def test_a_line_of_the_end_of_a_transient_holds_the_noise_of_a_line_of_a_period(decay, spacing, period):
+    members = [record(seed, decay=decay, period=period) for seed in range(12)]
+    found, *spectra = ends_of_transients(members, TOP)
+    assert found == spacing
+    for X, std in zip(spectra, (STD, 1e-3 * STD), strict=True):
+        assert X.shape == (12, TOP // spacing + 1, 2)
+        power = np.mean(np.abs(X[:, 2:]) ** 2) * period / std**2
+        # Of 24 spectra of at least 74 lines, of which a window leaves half: 3.3 %.
+        assert power == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "records",
+    [
+        [record(0, decay=0.25)],  # goes on
+        [record(0, steady=2)],
+        [record(0, transient=0)],
+        [record(0), record(1, steady=2)],
+    ],
+)
+def test_nothing_is_told_where_the_transient_goes_on_or_periods_repeat(records):
+    assert ends_of_transients(records, TOP) is None
+
+
+def test_nothing_is_told_by_few_lines():
+    assert ends_of_transients([record(0)], 20) is None
+
+
+@pytest.mark.parametrize("torque", [1e-2, 1.0])
+@pytest.mark.parametrize("lines", [60, 400])
+def test_the_likeliest_levels_are_those_of_the_noise(torque, lines):
+    """Also where noise of the positions rises by ten orders, and that of the torque shows in a few lines alone."""
+    rng, tau, q = np.random.default_rng(5), torque * np.array([1.0, 4.0]), np.array([2.0, 0.5])
+    gain = np.geomspace(1e-3, 1e2, lines)[:, None, None] * np.array([[1.0, 0.1], [0.2, 1.0]])
+    errors = []
+    for _ in range(20):
+        expected = tau + np.einsum("kij,j->ki", np.abs(gain) ** 2, q)
+        power = expected * rng.gamma(8.0, 1.0 / 8.0, size=expected.shape)
+        errors.append(np.concatenate(_white_levels(power, gain)) / np.concatenate([tau, q]) - 1.0)
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.1
+    # Eight degrees of freedom a line, and a third of the lines or more hold each.
+    assert np.std(errors, axis=0).max() < 2.0 / np.sqrt(8.0 * lines / 3.0)
+
+
+def test_the_levels_have_settled():
+    rng = np.random.default_rng(2)
+    gain = np.geomspace(1e-3, 1e2, 200)[:, None, None] * np.eye(2)
+    power = (1.0 + np.einsum("kij->ki", gain**2)) * rng.exponential(size=(200, 2))
+    more = [np.concatenate(_white_levels(power, gain))]
+
+    def slope(level):
+        """Of the negative log-likelihood by the logarithms of the levels, over the number of lines."""
+        m = level[:2] + np.einsum("kij,j->ki", gain**2, level[2:])
+        by_mean = (1.0 / m - power / m**2)[1:]
+        return np.concatenate([np.sum(by_mean * level[:2], axis=0), np.sum(by_mean * np.einsum("kij->ki", gain[1:] ** 2) * level[2:], axis=0)]) / 200
+
+    assert LEVEL_STEPS >= 30 and np.abs(slope(more[0])).max() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def single(clean):
+    """The clean experiment, one steady period of each record, without words on noise."""
+    data, _ = clean
+
+    def cut(s):
+        if s.kind != "multisine":
+            return s
+        last = (s.transient_periods + 1) * s.period
+        return replace(s, periods=s.transient_periods + 1, **s.part(slice(0, last)))
+
+    return replace(data, segments=tuple(cut(s) for s in data.segments), q_std=None, tau_std=None)
+
+
+def test_noise_of_an_arm_is_found_from_one_steady_period(identified, single):
+    _, whole, _ = identified  # by the scatter between periods
+    setup, baseline = identify(single)
+    assert all(g.U_periods.shape[1] == 1 and g.shows_noise for g in setup.problem.groups)
+    assert setup.problem.q_std == pytest.approx(whole.problem.q_std, rel=0.1)
+    # Torque noise shows above that of the positions in a few slow lines; differences of samples show what circulates in the loop.
+    assert setup.problem.tau_std == pytest.approx(whole.problem.tau_std, rel=0.25)
+    assert np.max(set_up(single).problem.tau_std / whole.problem.tau_std) > 10.0
+    assert np.all(np.abs(baseline.costs / baseline.counts - 1.0) < 0.2)
+
+
+def test_picked_records_keep_their_noise(single):
+    group = set_up(single).problem.groups[0]
+    rows = np.array([0, 2])
+    assert np.array_equal(group.pick(rows).U_noise, group.U_noise[rows])
