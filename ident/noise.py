@@ -117,7 +117,12 @@ def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     Powers of lines of noise are exponential about their mean ``m``: ``sum(log m + power / m)`` is least (Whittle 1953), by
     multiplicative steps, under which variances stay positive (Fevotte, Bertin and Durrieu, Neural Comput. 21, 2009, eq. 4.7).
+
+    Raises:
+        FloatingPointError: power or gain without bounds.
     """
+    if not (np.all(np.isfinite(power)) and np.all(np.isfinite(Z))):
+        raise FloatingPointError("noise without bounds")
     n, k = power.shape[1], np.arange(power.shape[1])
     columns = np.zeros((len(power), n, 2 * n))
     columns[:, k, k] = 1.0
