@@ -126,5 +126,5 @@ def test_no_more_is_taken_off_than_leaves_information(identified):
 def test_an_effect_that_the_data_do_not_feel_is_no_candidate(identified):
     _, setup, result = identified
     h = next(h for h in catalogue(setup.problem.structure) if (h.effect, h.place) == ("torque_saturation", "elbow_joint"))
-    model = replace(result.model, effects=(Effect(h, np.array([1e6])),))
+    model = replace(result.model, effects=(Effect(h, np.array([1e6, 0.03])),))
     assert refit(setup.problem, model, result.weights, result.remainders, 1) is None

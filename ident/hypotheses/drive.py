@@ -7,6 +7,7 @@ import numpy as np
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.motion import Motion
 
+KNEE = Parameter("knee", "1", 2e-3, 0.5, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
 
@@ -90,24 +91,27 @@ def torque_delay(joint: int, place: str) -> Hypothesis:
 def torque_saturation(joint: int, place: str) -> Hypothesis:
     """Delivered torque is clipped at ``limit``, which takes no more than the peaks.
 
-    A limit near zero would deliver nothing, and so explain any motor that hardly moves.
+    An amplifier that limits by a controller of its own bends before it does: ``u (1 + |u / limit|^(1 / knee))^-knee``, which
+    clips sharply where the knee is small, and is about a hyperbolic tangent where it is 0.4. A limit near zero would deliver
+    nothing, and so explain any motor that hardly moves.
     """
 
-    def excess(limit: float, motion: Motion, j: int) -> np.ndarray:
+    def excess(limit: float, knee: float, motion: Motion, j: int) -> np.ndarray:
         u = motion.torque(j)
         limit = max(limit, LEAST_LIMIT * motion.peak_torque(j))
-        return u - np.clip(u, -limit, limit)
+        over = np.log(np.maximum(np.abs(u), 1e-12 * limit) / limit) / knee
+        return u * (1.0 - np.exp(-knee * np.logaddexp(0.0, over)))
 
     return Hypothesis(
         "torque_saturation",
         place,
         joint,
         "drive",
-        (Parameter("limit", "N m", 1e-6, 1e8, log=True, step=1e-3),),
-        lambda p, motion, j, k, U: U + motion.lines(excess(p[0], motion, j)),
-        lambda scale: [(f * scale.peak_torque,) for f in (0.5, 0.65, 0.8, 0.9, 0.96)],
+        (Parameter("limit", "N m", 1e-6, 1e8, log=True, step=1e-3), KNEE),
+        lambda p, motion, j, k, U: U + motion.lines(excess(*p, motion, j)),
+        lambda scale: [(f * scale.peak_torque, KNEE.center) for f in (0.5, 0.65, 0.8, 0.9, 0.96)],
         lambda motion, j, k, shape: Screen(
-            (excess(shape[0], motion, j),), lambda c: np.array([shape[0]]) if c[0] > 0.2 else None, shape
+            (excess(*shape, motion, j),), lambda c: np.array(shape) if c[0] > 0.2 else None, shape
         ),
         "The motor of {joint} delivers no more than {limit:.4g} N m: the residual torque sits at the peaks.",
         variable="torque",
