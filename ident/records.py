@@ -28,7 +28,7 @@ CREEP = 6.0  # standard deviations of their noise, by which both must differ
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
-MOTION_BAND = 2.0  # the same of motions: products of two signals beyond it would fold into the compared band; short of the modes of the links
+MOTION_BAND = 1.5  # the same of motions
 FAST_BAND = 6.0  # of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
 
 
