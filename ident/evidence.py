@@ -23,6 +23,7 @@ LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave
 POINTLESS_NATS = 5.0  # against an effect whose essential parameters are found absent
 DECOY_NATS = 2.0  # an effect of the catalogue is preferred to a decoy that does as well
 WAVE = "sine", "cosine"  # amplitudes of an effect that repeats along its variable
+FAR = 0.05  # of what the best candidate explains, that another leaves beyond it, from which it explains something else
 RIVAL = 0.1  # share of what the best candidate explains, where it explains most, that makes another its rival
 
 
@@ -106,7 +107,8 @@ def weigh(candidates: Sequence[Candidate], excess: np.ndarray, falls: np.ndarray
     Under pure noise the evidence is half the difference of the costs. What the best model leaves
     above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
     difference at a joint counts only against ``temper + MODEL_ERROR_SHARE x excess`` there. Parameters count by how far
-    the data narrow them down (``occam``), at the joints where the effect is seen.
+    the data narrow them down (``occam``), at the joints where the effect is seen. What explains far less than the best of
+    them may be another cause, at a joint that little is left at: all that it leaves counts as at the joints of the best.
 
     Args:
         excess: (n,) cost beyond noise by joint that the best of them leaves (``errors_by_joint``).
@@ -118,8 +120,11 @@ def weigh(candidates: Sequence[Candidate], excess: np.ndarray, falls: np.ndarray
     tempers = temper + MODEL_ERROR_SHARE / 6.0 * excess
     where = np.maximum(falls, 0.0)
     where = where / np.sum(where) if np.any(where) else np.full(len(falls), 1.0 / len(falls))
-    evidence = -0.5 * np.sum((costs - costs[np.argmin(np.sum(costs, axis=1))]) / tempers, axis=1) - DECOY_NATS * decoy
     seen = 1.0 / float(np.sum(where / tempers))
+    more = costs - costs[np.argmin(np.sum(costs, axis=1))]
+    evidence = -0.5 * np.sum(more / tempers, axis=1)
+    far = np.sum(more, axis=1) > FAR * np.sum(falls)
+    evidence = np.where(far, np.minimum(evidence, -0.5 * np.sum(more, axis=1) / seen), evidence) - DECOY_NATS * decoy
     evidence += [occam(c, seen) + c.hypothesis.options.get("nats", 0.0) for c in candidates]
     evidence -= evidence.max()
     probability = np.exp(evidence) / np.exp(evidence).sum()

@@ -78,15 +78,20 @@ def test_what_another_cause_leaves_at_its_joint_blurs_little_elsewhere(named):
     above = 1e4 - 0.1 * 1e3  # beyond what the noise may be short of, which is an error of the law as well
     assert excess == pytest.approx(LAW_ERROR * above + np.array([0.0, 0.0, 0.0, 0.0, 0.0, above + 100.0]))
 
-    def odds(more):
+    def odds(more, falls=np.full(6, 1e5)):
         """Log odds of one that leaves that, over one that leaves ``more``."""
         pair = [candidate(h, [1e-3], [1.0]) for h in (one, other)]
         pair = [replace(c, fit=replace_costs(c.fit, x)) for c, x in zip(pair, (left, left + more), strict=True)]
-        evidence = {c.hypothesis.place: c.log_evidence for c in weigh(pair, excess, np.ones(6))}
+        evidence = {c.hypothesis.place: c.log_evidence for c in weigh(pair, excess, falls)}
         return evidence["elbow_joint"] - evidence["wrist_1_joint"]
 
     assert odds(np.array([24.0] * 5 + [0.0])) == pytest.approx(0.5 * 120.0 / (TEMPER + 0.05 * LAW_ERROR * above))
     assert odds(np.array([0.0] * 5 + [120.0])) == pytest.approx(0.5 * 120.0 / (TEMPER + 0.05 * excess[-1]))
+    # One that explains far less of joint 6 is another cause, and wins nothing by the little that it explains at joints 1 to 5.
+    at_last = np.array([0.0] * 5 + [1e4])
+    elsewhere = np.array([-24.0] * 5 + [1e3])
+    assert odds(elsewhere, at_last) == pytest.approx(0.5 * 880.0 / (TEMPER + 0.05 * excess[-1]))
+    assert odds(elsewhere, 1e3 * at_last) < 0.0
 
 
 def replace_costs(fit, costs):
