@@ -18,7 +18,8 @@ from ident.transients import LEAKED
 PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around it
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
 WINDOWED = 2.0  # neighbouring lines of a spectrum through a window, that count as one
-LEVEL_STEPS = 60
+LEVEL_STEPS = 60  # towards the likeliest levels
+LEAST_VARIANCE = 1e-140  # of a line, of records without any noise
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
 DOUBT = 1.5  # of the power of noise, by which what such lines hold may be too little
@@ -129,12 +130,12 @@ def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndar
     columns[:, :, n:] = np.abs(Z) ** 2
     floor = 1e-12 * np.maximum(power.mean(axis=0), 1e-300)
     A = columns[1:].reshape(-1, 2 * n)
-    b = np.maximum(power, floor)[1:].ravel()
+    b = np.maximum(power, LEAST_VARIANCE)[1:].ravel()
     own = np.maximum(np.diagonal(columns[1:, :, n:], axis1=1, axis2=2), 1e-300)
     level = np.concatenate([np.median(power[1:], axis=0), np.median(power[1:] / own, axis=0)])
-    level = np.maximum(level, 1e-300)
+    level = np.maximum(level, LEAST_VARIANCE)
     for _ in range(LEVEL_STEPS):
-        inverse = 1.0 / (A @ level + 1e-300)
+        inverse = 1.0 / np.maximum(A @ level, LEAST_VARIANCE)
         level = level * (A.T @ (b * inverse**2)) / np.maximum(A.T @ inverse, 1e-300)
     return level[:n] + floor, level[n:] + 1e-12 * floor
 

@@ -45,7 +45,7 @@ from ident.problem import Weights, data_counts, predictions
 from ident.pruning import pruned, renamed, without_shadows
 from ident.refits import polish, refit, reweighted, settled, turned, under_own_noise
 from ident.reporting import frf_views, most_affected
-from ident.rounds import Round, leaves_much, left_share, outdone, settles_its_joint, shadows, with_name
+from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
 from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
 from ident.search import PER_EFFECT, STRONG, begin, choose, explore, other_bodies
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
@@ -697,6 +697,23 @@ def test_one_joint_alone_may_be_loud(identified, at_joint, told, expected):
     if told == 0.0:
         assert settled(one)
         assert (discrepancy_p_value(one) < 1e-9) == expected and discrepancy_p_value(quiet) > 0.5
+
+
+@pytest.mark.parametrize(("missing", "best", "expected"), [
+    ("torque_constant", "sensor_delay", True),
+    ("torque_constant", "backlash", False),  # the arm may be in another motion under its law
+    ("backlash", "sensor_delay", False),
+])  # fmt: skip
+def test_where_a_linear_step_tells_the_rest_no_strong_effect_is_sought(identified, named, missing, best, expected):
+    _, setup, result = identified
+    values = {"torque_constant": [1.3], "backlash": [2e-3, 0.0]}[missing]
+    with_it = replace(result.model, effects=(Effect(named[missing, "elbow_joint"], np.array(values)),))
+    before = predictions(setup.problem, result.model, result.remainders)
+    problem = recorded_with(setup.problem, before, predictions(setup.problem, with_it, result.remainders))
+    left = reweighted(problem, result, result.weights)
+    assert left.chi2_per_dof > 5.0
+    found = next_answers(problem, left, named[best, "wrist_1_joint"], left, catalogue(problem.structure))
+    assert found is expected
 
 
 def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identified):

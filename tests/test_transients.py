@@ -86,6 +86,21 @@ def test_the_levels_have_settled():
     assert LEVEL_STEPS >= 30 and np.abs(slope(more[0])).max() < 1e-4
 
 
+@pytest.mark.parametrize("silent", [[0], [1], [0, 1]])
+def test_records_without_noise_have_none(silent):
+    gain = np.geomspace(1e-3, 1e2, 100)[:, None, None] * np.eye(2)
+    power = np.random.default_rng(3).exponential(size=(100, 2))
+    power[:, silent] = 0.0
+    tau, q = _white_levels(power, gain)
+    assert np.all(np.isfinite([tau, q])) and np.all(tau > 0.0) and np.all(q > 0.0)
+    assert np.all(tau[silent] < 1e-20) and np.all(q[silent] < 1e-20)
+
+
+def test_noise_without_bounds_is_refused():
+    with pytest.raises(FloatingPointError, match="without bounds"):
+        _white_levels(np.full((20, 2), np.inf), np.ones((20, 2, 2)))
+
+
 @pytest.fixture(scope="module")
 def single(clean):
     """The clean experiment, one steady period of each record, without words on noise."""
