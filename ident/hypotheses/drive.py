@@ -7,7 +7,7 @@ import numpy as np
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.motion import Motion
 
-KNEE = Parameter("knee", "1", 2e-3, 0.5, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
+KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
 
@@ -92,7 +92,7 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
     """Delivered torque is clipped at ``limit``, which takes no more than the peaks.
 
     An amplifier that limits by a controller of its own bends before it does: ``u (1 + |u / limit|^(1 / knee))^-knee``, which
-    clips sharply where the knee is small, and is about a hyperbolic tangent where it is 0.4. A limit near zero would deliver
+    clips sharply where the knee is small, and takes 2 % at two thirds of the limit where it is largest. A limit near zero would deliver
     nothing, and so explain any motor that hardly moves.
     """
 
@@ -115,6 +115,7 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
         ),
         "The motor of {joint} delivers no more than {limit:.4g} N m: the residual torque sits at the peaks.",
         variable="torque",
+        options={"shown": "limit"},
     )
 
 
