@@ -20,10 +20,9 @@ from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps
 from ident.records import build_groups
-from ident.refits import reweighted
+from ident.refits import under_own_noise
 from ident.rest import difference_noise
 from ident.torque_fit import Fit
-from ident.weights import make_weights
 from robot_assets.errors import DataError
 
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
@@ -219,17 +218,13 @@ def under_noise_beside_causes(
     raised = np.any(problem.q_std > q_std) and not any(g.shows_noise for g in problem.groups)
     if raised and guessed_noise(dataset)[0]:
         guess = replace(problem, q_std=np.minimum(problem.q_std, q_std), tau_std=np.minimum(problem.tau_std, tau_std))
-        calmer = with_noise_of_unexcited_lines(dataset, guess, under_noise_of(guess, result))
-        if np.all(LOUD * calmer.q_std**2 < problem.q_std**2):
-            setup, result = replace(setup, problem=calmer), under_noise_of(calmer, result)
-            first = fit_baseline(calmer, progress)
+        seen = under_own_noise(guess, result)
+        calmer = problem if seen is None else with_noise_of_unexcited_lines(dataset, guess, seen)
+        again = under_own_noise(calmer, result) if np.all(LOUD * calmer.q_std**2 < problem.q_std**2) else None
+        if again is not None:
+            setup, result, first = replace(setup, problem=calmer), again, fit_baseline(calmer, progress)
     other, lowered = under_noise_that_is_left(dataset, setup, result, progress)
     return other, first if other is setup else lowered
-
-
-def under_noise_of(problem: Problem, result: Fit) -> Fit:
-    """A fit as it stands, its cost under the noise of a problem."""
-    return reweighted(problem, result, make_weights(problem, predictions(problem, result.model, result.remainders), 0.0))
 
 
 def guessed_noise(dataset: Dataset) -> list[bool]:

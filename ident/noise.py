@@ -55,11 +55,11 @@ def residual_covariance(
     Args:
         group: the records.
         Z: (L, n, n) recorded torque per motor position.
-        tau_std, q_std: (n,) sample noise, used where single periods give no scatter.
+        tau_std, q_std: (n,) sample noise, used where nothing shows it (``_scatter``).
         samples: samples per period.
 
-    The shape over frequency is that of white channel noise carried by ``Z``; the scatter between
-    periods sets its size, and corrects its shape by a smooth matrix where there is enough of it.
+    The shape over frequency is that of white channel noise carried by ``Z``; what shows the noise alone
+    (``_scatter``) sets its size, and corrects its shape by a smooth matrix where there is enough of it.
     """
     found = _scatter(group, Z)
     if found is None:
@@ -76,7 +76,8 @@ def residual_covariance(
     smooth, count = _moving_mean(scatter, half)
     dof = (count * dof_line)[:, None, None]
     shape = (dof * smooth + PRIOR_DOF * np.eye(Z.shape[1])) / (dof + PRIOR_DOF)
-    shape = shape[np.abs(lines[None, :] - np.arange(len(Zk))[:, None]).argmin(axis=1)]
+    nearest = np.searchsorted(0.5 * (lines[1:] + lines[:-1]), np.arange(len(Zk)))
+    shape = shape[nearest]
     return root @ shape @ np.conj(np.swapaxes(root, 1, 2))
 
 

@@ -40,7 +40,7 @@ def ends_of_transients(members: Sequence[Segment], top: int) -> tuple[int, np.nd
         if lines < FEWEST_LINES + LEAKED:
             return None
         channels = [np.stack([a[c][-width:] - b[c][-width:] for a, b in zip(after, before, strict=True)]) for c in ("tau", "q")]
-        if any(_dies_down(x, lines // 2 + 1) for x in channels):
+        if any(_goes_on(x, lines // 2 + 1) for x in channels):
             continue
         # A difference of two holds twice the noise, and a line of a period that of its samples over their number.
         torque, position = (_spectrum(x, lines) / np.sqrt(2.0 * members[0].period) for x in channels)
@@ -48,7 +48,7 @@ def ends_of_transients(members: Sequence[Segment], top: int) -> tuple[int, np.nd
     return None
 
 
-def _dies_down(x: np.ndarray, lines: int) -> bool:
+def _goes_on(x: np.ndarray, lines: int) -> bool:
     """Whether differences (S, N, n) are larger in their first half than in their second, by some channel."""
     half = x.shape[1] // 2
     first, second = (np.sum(np.abs(_spectrum(part, lines)[:, LEAKED:]) ** 2, axis=(0, 1)) for part in (x[:, :half], x[:, -half:]))

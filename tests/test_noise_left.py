@@ -116,7 +116,7 @@ def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tm
     raised = replace(setup.problem, q_std=3.0 * guess.q_std, tau_std=3.0 * guess.tau_std)
     if coloured:
         told = replace(told, costs=2.0 * told.counts)
-        monkeypatch.setattr("ident.identification.under_noise_of", lambda problem, result: result)
+        monkeypatch.setattr("ident.identification.under_own_noise", lambda problem, result: result)
         monkeypatch.setattr("ident.identification.unexcited_noise", lambda groups, whitened: 9.0)
     other, first = under_noise_beside_causes(data, replace(setup, problem=raised), told)
     assert other.problem.q_std == pytest.approx((3.0 if coloured else 1.0) * guess.q_std)
