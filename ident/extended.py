@@ -65,12 +65,27 @@ class Prediction:
     @cached_property
     def filters(self) -> tuple[np.ndarray, np.ndarray]:
         """What linear drives record per torque that they deliver, and the true position per measured one; (L, n) each."""
-        recorded, true = np.ones((2, len(self.plane.s), self.structure.n), complex)
-        for effect in self.model.effects:
-            h = effect.hypothesis
-            if "filter" in h.options:
-                (recorded if h.channel == "drive" else true)[:, h.joint] *= h.options["filter"](effect.p, self.plane.s)
-        return recorded, true
+        return linear_filters(self.model, self.plane.s)
+
+
+def linear_filters(model: Model, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What linear drives record per torque that they deliver, and the true position per measured one; (F, n) each.
+
+    Args:
+        s: (F,) complex frequencies, rad/s.
+    """
+    recorded, true = np.ones((2, len(s), model.structure.n), complex)
+    for effect in model.effects:
+        h = effect.hypothesis
+        if "filter" in h.options:
+            (recorded if h.channel == "drive" else true)[:, h.joint] *= h.options["filter"](effect.p, s)
+    return recorded, true
+
+
+def passed_by_filters(model: Model, s: np.ndarray) -> np.ndarray:
+    """Measured position of a bare motor per recorded torque, over that with neither drives nor sensors that filter; (F, n)."""
+    recorded, true = linear_filters(model, s)
+    return 1.0 / (recorded * true)
 
 
 def predict(
@@ -113,7 +128,8 @@ def predict_at(
         steps = REMAINDER_STEPS if W is None else 0
     if W is not None and W.shape[-1] != structure.n_coordinates:
         W, steps = None, max(steps, REMAINDER_STEPS)
-    Q = true_position(group, par, sampling)
+    filtered = any("filter" in e.hypothesis.options for e in model.effects)
+    Q = true_position(group, par, sampling, partial(passed_by_filters, model) if filtered else None)
     by_channel: dict[str, list[Effect]] = {}
     for effect in model.effects:
         by_channel.setdefault(effect.hypothesis.channel, []).append(effect)

@@ -13,6 +13,7 @@ couple joints, and ``b`` is zero unless the links have friction of their own. Al
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -166,6 +167,9 @@ def damping_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
     return out
 
 
+IMAGES = 8  # of a held torque on either side, that drives and sensors may change; each of the next has a seven-hundredth of the first at most
+
+
 def hold_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarray:
     """Continuous torque per recorded sample torque: the zero-order hold; (F,) complex.
 
@@ -177,13 +181,19 @@ def hold_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarra
     return np.exp(-1j * x) * np.sinc(x / np.pi)
 
 
-def alias_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarray:
+def alias_response(
+    omega: np.ndarray, sample_time: float, hold: str, passed: Callable[[np.ndarray], np.ndarray] | None = None
+) -> np.ndarray:
     """Position that the images of a held torque add to a unit inertia in the band; (F,) s2.
 
     The spectrum of a held torque has images about multiples of the sample rate. Far above its
     resonances every motor is its bare inertia, so what the images add after sampling is that of a
     double integrator: its exact sampled response ``T^2 (z + 1) / (2 (z - 1)^2)`` less its
     baseband part. The error left is of the order of (resonance / sample rate)^2 of this term.
+
+    Args:
+        passed: what drives and sensors let pass at complex frequencies (F,), rad/s; (F, n). The result is (F, n) then. A current loop
+            that takes a millisecond lets hardly any of the images pass, where it takes little from the band.
     """
     if hold == "none":
         return np.zeros(len(omega), complex)
@@ -192,7 +202,13 @@ def alias_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarr
     z = np.exp(1j * w * sample_time)
     exact = sample_time**2 * (z + 1) / (2 * (z - 1) ** 2)
     out[omega > 0] = exact + hold_response(w, sample_time, hold) / w**2
-    return out
+    if passed is None:
+        return out
+    order = np.concatenate([np.arange(-IMAGES, 0), np.arange(1, IMAGES + 1)])
+    image = omega[:, None] + order * (2 * np.pi / sample_time)
+    each = -hold_response(image, sample_time, hold) / image**2
+    factor = passed(1j * image.ravel()).reshape(*image.shape, -1)
+    return out[:, None] + np.einsum("fm,fmn->fn", each, factor - 1.0)
 
 
 def impedance(

@@ -122,10 +122,12 @@ def plane_at(
     return Plane(lin, s, Z, A_inv, C, record, spring_gain, link_gain, link_per_position, link_per_spring, -rows)
 
 
-def true_position(group: Group, par: Parameters, sampling: Sampling) -> np.ndarray:
-    """Motor position without what the images of the held torque add; (S, L, n) rad."""
-    alias = alias_response(group.omega, sampling.sample_time, sampling.hold)
-    return group.Q - alias[:, None] * group.U / par.inertia
+def true_position(
+    group: Group, par: Parameters, sampling: Sampling, passed: Callable[[np.ndarray], np.ndarray] | None = None
+) -> np.ndarray:
+    """Motor position without what the images of the held torque add; (S, L, n) rad. ``passed`` as of ``alias_response``."""
+    alias = alias_response(group.omega, sampling.sample_time, sampling.hold, passed).reshape(len(group.omega), -1)
+    return group.Q - alias * group.U / par.inertia
 
 
 def static_remainder(structure: Structure, par: Parameters, plane: Plane, group: Group) -> np.ndarray:

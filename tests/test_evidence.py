@@ -585,7 +585,7 @@ def test_an_extension_that_surely_harms_is_taken_back(interval, bad):
     assert not harmful(None)
 
 
-@pytest.mark.parametrize("effect, start", [("coulomb_friction", (1e-5, 0.0, 1e-3)), ("cogging", (1e-3, 101.0, 1e-3))])
+@pytest.mark.parametrize("effect, start", [("coulomb_friction", (1e-5, 0.0, 1e-3)), ("cogging", (1e-3, 101.0, 1e-3, 0.0, 0.0))])
 def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified, named, effect, start):
     """The data hold no effect: a friction that was let in stands for nothing, and so does a ripple of whatever period."""
     _, setup, result = identified

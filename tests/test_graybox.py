@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 
 from ident.chain import LinkChange, build_structure
-from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
+from ident.graybox import Parameters, alias_response, equilibrium, hold_response, linearise, sampled_frf
 from ident.hypotheses import catalogue
 from robot_assets.robot import Elasticity, load_robot
 
@@ -131,3 +131,18 @@ def test_the_body_of_a_link_is_changed_with_its_load_or_without(ur10):
     assert [h.options["with_load"] for h in links] == [False, True]
     known = build_structure(ur10, inertias={"wrist_3_joint": both})  # what was found holds the load
     assert sum(h.key == ("link_inertia", "wrist_3_link") for h in catalogue(known)) == 1
+
+
+def test_images_of_a_held_torque_pass_the_drive_first():
+    """A current loop of a millisecond lets little of them pass: sampled motion of a bare motor behind it, in closed form."""
+    T, inertia, lag = 1e-3, 0.7, 1e-3
+    omega = 2 * np.pi * np.array([0.0, 5.0, 40.0, 150.0])
+    found = alias_response(omega, T, "zoh", lambda s: 1.0 / (1.0 + lag * s)[:, None])[1:, 0]
+    # States: angle, velocity, torque of the loop; stepped exactly over a held sample.
+    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0 / inertia], [0.0, 0.0, -1.0 / lag]])
+    held = scipy.linalg.expm(T * np.block([[A, np.array([[0.0], [0.0], [1.0 / lag]])], [np.zeros((1, 4))]]))
+    for w, images in zip(omega[1:], found, strict=True):
+        z = np.exp(1j * w * T)
+        whole = np.linalg.solve(z * np.eye(3) - held[:3, :3], held[:3, 3])[0]
+        band = hold_response(np.array([w]), T, "zoh")[0] / (inertia * (1j * w) ** 2 * (1.0 + 1j * w * lag))
+        assert images / inertia == pytest.approx(whole - band, rel=5e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.hypotheses.ripple import SECOND, ripple
 from ident.motion import Motion
 
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
@@ -120,16 +121,16 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
 
 
 def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothesis:
-    """``amplitude sin(periods_per_rev q + phase)`` at the motor."""
+    """``amplitude sin(periods_per_rev q + phase)`` at the motor, with a second harmonic."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        q = motion.q(j)
-        return p[0] * np.sin(p[1] * q) + p[2] * np.cos(p[1] * q)
+        sine, n, cosine, *second = p
+        return ripple(sine, cosine, second, n * motion.q(j))[0]
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q = motion.q(j)
         return Screen(
-            (np.sin(shape[0] * q), np.cos(shape[0] * q)), lambda c: np.array([c[0], shape[0], c[1]]), shape
+            (np.sin(shape[0] * q), np.cos(shape[0] * q)), lambda c: np.array([c[0], shape[0], c[1], 0.0, 0.0]), shape
         )
 
     return Hypothesis(
@@ -141,6 +142,7 @@ def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothe
             Parameter("sine", "N m", -1e7, 1e7),
             Parameter("periods_per_rev", "1", 0.3, 1e5, step=1e-3),
             Parameter("cosine", "N m", -1e7, 1e7),
+            *SECOND,
         ),
         law,
         lambda scale: [(n,) for n in scale.wave_numbers],

@@ -8,6 +8,7 @@ import numpy as np
 
 from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen
+from ident.hypotheses.ripple import SECOND, ripple
 from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
 
@@ -152,7 +153,7 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
 
 
 def transmission_error(joint: int, place: str) -> Hypothesis:
-    """Gear sees ``q + amplitude sin(periods_per_rev q + phase)`` of the motor.
+    """Gear sees ``q + amplitude sin(periods_per_rev q + phase)`` of the motor, with a second harmonic.
 
     A gear without losses passes the torque that it carries back to the motor with the slope of the
     error, ``tau_s d(error)/dq`` (virtual work); ``reaction`` is 1 then, and fitted because a gear
@@ -160,10 +161,9 @@ def transmission_error(joint: int, place: str) -> Hypothesis:
     """
 
     def parts(p: np.ndarray, motion: Motion, j: int) -> tuple[np.ndarray, np.ndarray]:
-        sine, n, cosine, reaction = p
-        angle = n * motion.q(j)
-        slope = n * (sine * np.cos(angle) - cosine * np.sin(angle))
-        return sine * np.sin(angle) + cosine * np.cos(angle), reaction * slope * motion.tau_s(j)
+        sine, n, cosine, reaction, *second = p
+        error, slope = ripple(sine, cosine, second, n * motion.q(j))
+        return error, reaction * n * slope * motion.tau_s(j)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         n, reaction = shape
@@ -173,7 +173,7 @@ def transmission_error(joint: int, place: str) -> Hypothesis:
         sine, cosine, carried = np.sin(angle), np.cos(angle), reaction * n * motion.tau_s(j)
         return Screen(
             (spring * motion.lines(sine), spring * motion.lines(cosine)),
-            lambda c: np.array([c[0], n, c[1], reaction]),
+            lambda c: np.array([c[0], n, c[1], reaction, 0.0, 0.0]),
             shape,
             (cosine * carried, -sine * carried),
         )
@@ -188,6 +188,7 @@ def transmission_error(joint: int, place: str) -> Hypothesis:
             Parameter("periods_per_rev", "1", 0.3, 1e5, step=1e-3),
             Parameter("cosine", "rad", -0.1, 0.1, step=1e-7),
             Parameter("reaction", "1", -0.5, 1.5, nuisance=True, step=1e-2, null=1.0),
+            *SECOND,
         ),
         lambda p, motion, j, k: parts(p, motion, j),
         lambda scale: [(n, 1.0) for n in scale.wave_numbers],

@@ -1,0 +1,72 @@
+"""Ripples with a second harmonic: their law, and one hidden in the plant."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ident.diagnosis import diagnose
+from ident.hypotheses.ripple import ripple
+from sim import parse_effect, run_experiment
+from sim.effects.effect import Torque
+from sim.effects.transmission import carried
+from sim.experiment import draw_drives
+from tests.conftest import small_plan, through_files
+
+sizes = st.floats(-0.6, 0.6)
+
+
+@given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.tuples(sizes, sizes), st.floats(-20.0, 20.0))
+def test_a_ripple_and_its_slope(sine, cosine, second, angle):
+    value, slope = ripple(sine, cosine, np.array(second), np.array(angle))
+    size = np.hypot(sine, cosine)
+    harmonics = [sine * np.sin(angle), cosine * np.cos(angle), size * second[0] * np.sin(2 * angle), size * second[1] * np.cos(2 * angle)]
+    assert value == pytest.approx(sum(harmonics), abs=1e-9)
+    h = 1e-5
+    ends = [ripple(sine, cosine, np.array(second), np.array(angle + d))[0] for d in (-h, h)]
+    assert slope == pytest.approx((ends[1] - ends[0]) / (2 * h), abs=1e-6)
+
+
+@dataclass(frozen=True)
+class UnevenGear:
+    """The gear sees ``q`` with an error of two harmonics; power is conserved."""
+
+    place: str
+    amplitude: float
+    periods_per_rev: float
+    second: float
+
+    def torque(self, run):
+        j, load, a, n = run.joint(self.place), carried(run, self.place), self.amplitude, self.periods_per_rev
+
+        def step(x):
+            angle = n * x.q[:, j]
+            error = a * (np.sin(angle) + self.second * np.cos(2 * angle))
+            slope = a * n * (np.cos(angle) - 2 * self.second * np.sin(2 * angle))
+            gear = load(x, error, slope * x.v[:, j])
+            h = gear - load(x)
+            return Torque(j, -h - slope * gear, h)
+
+        return step
+
+
+def uneven_motor(robot, size):
+    waves = [(size, 202.0, 0.0), (0.2 * size, 404.0, -1.0)]
+    return [parse_effect(f"cogging@elbow_joint:amplitude={a},periods_per_rev={n},phase={p}", robot) for a, n, p in waves]
+
+
+@pytest.mark.parametrize("name", ["cogging", pytest.param("transmission_error", marks=pytest.mark.slow)])
+def test_a_ripple_with_a_second_harmonic_is_one_cause(ur10, tmp_path, name):
+    """Nothing else is named for what a sine would leave of it."""
+    size = {"cogging": 6.0, "transmission_error": 5e-5}[name]
+    effects = uneven_motor(ur10, size) if name == "cogging" else [UnevenGear("elbow_joint", size, 202.0, 0.2)]
+    drives = draw_drives(np.random.default_rng(8), ur10)
+    data = run_experiment(small_plan(ur10, 8), effects, seed=8, drives=drives, timestep=5e-4)
+    verdict = diagnose(through_files(data, tmp_path))
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.1] == [(name, "elbow_joint")]
+    found = verdict.causes[0].parameters
+    assert found["amplitude"].value == pytest.approx(size, rel=0.03)
+    assert found["periods_per_rev"].value == pytest.approx(202.0, rel=1e-3)
+    assert verdict.unexplained_verdict == "noise floor reached"
