@@ -65,7 +65,12 @@ def fit_baseline(
         # Where they only go astray elsewhere they stand for what is missing.
         if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
             best = other
-    # Its weights are those of a model on the way, which passes on another noise.
+    return replace(renewed(problem, best, progress), softer=first.softer)
+
+
+def renewed(problem: Problem, result: Fit, progress: Callable[[str], None] | None = None) -> Fit:
+    """A fit under the noise that its own model passes on: its weights are those of a model on the way."""
+    best = result
     for _ in range(RENEWALS):
         on_the_way = best.model.par.to_log()
         try:
@@ -74,7 +79,7 @@ def fit_baseline(
             break  # drives gone astray pass on noise without bounds
         if np.max(np.abs(best.model.par.to_log() - on_the_way)) < SAME_NOISE:
             break
-    return replace(best, softer=first.softer)
+    return replace(best, softer=result.softer)
 
 
 def begun_again(problem: Problem, par: Parameters, lost: np.ndarray) -> Parameters:

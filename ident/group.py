@@ -44,6 +44,8 @@ class Group:
             None of a motion.
         noise_spacing, U_noise, Q_noise: (S, J, n) spectra of noise alone, every so many lines of the period, where a single
             period has no scatter (``ends_of_transients``); or None.
+        known_noise: (n,) variances of a line of torque and position by white noise, N2 m2 and rad2, of a single period of which they are
+            measured; or None.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -75,6 +77,7 @@ class Group:
     noise_spacing: int = 1
     U_noise: np.ndarray | None = None
     Q_noise: np.ndarray | None = None
+    known_noise: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def shows_noise(self) -> bool:
@@ -90,11 +93,14 @@ class Group:
     def scatter(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Covariances (K, n, n) of torque, of torque and position, and of position, of noise of the means; sums over records.
 
-        By the scatter between periods; None where there is one period, and beside link encoders.
+        By the scatter between periods, or noise that is known of a single one; None where neither is, and beside link encoders.
         """
         periods = self.U_periods.shape[1]
-        if periods < 2 or self.links:
+        if self.links or (periods < 2 and self.known_noise is None):
             return None
+        if periods < 2:
+            torque, position = (len(self.U) * np.tile(np.diag(x).astype(complex), (self.n_compared, 1, 1)) for x in self.known_noise)
+            return torque, np.zeros_like(torque), position
         U, Q = (
             (x - x.mean(axis=1, keepdims=True))[:, :, : self.n_compared].transpose(2, 3, 0, 1).reshape(self.n_compared, x.shape[-1], -1)
             for x in (self.U_periods, self.Q_periods)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, fit_baseline
+from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed
 from ident.chain import Structure, build_structure
 from ident.channel_checks import MOVES
 from ident.dataset import Dataset
@@ -166,10 +166,14 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
         raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
+    problem, held_out = with_known_noise(with_measured_noise(setup.problem, result)), setup.held_out
+    if any(g.known_noise is not None for g in problem.groups):
+        result = renewed(problem, result, progress)
+        # Few records are held out: all that the model is fitted to tell the noise better than the end of their own transients.
+        held_out = tuple(replace(g, U_noise=None, Q_noise=None) for g in held_out)
     # Where periods differ by a drift, as those of a motor that sticks do, what they differ by is no noise.
     share = 0.0 if np.any(drifting(setup.problem.groups)) else result.share
-    problem = replace(with_measured_noise(setup.problem, result), scatter_share=share)
-    return replace(setup, problem=problem), result
+    return replace(setup, problem=replace(problem, scatter_share=share), held_out=held_out), result
 
 
 def whitened(problem: Problem, result: Fit, found: Sequence[Prediction]) -> list[np.ndarray]:
@@ -257,6 +261,17 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
         return problem
     lowered = np.maximum(problem.tau_std * np.sqrt(power), least_noise(dataset, "tau"))
     return replace(problem, tau_std=np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(lowered, problem.tau_std)))
+
+
+def with_known_noise(problem: Problem) -> Problem:
+    """What noise adds to costs, of records of a single period whose noise is measured, by its levels: no periods differ there."""
+
+    def known(group: Group) -> Group:
+        if group.window is not None or group.U_noise is None:
+            return group
+        return replace(group, known_noise=tuple(std**2 / problem.samples(group) for std in (problem.tau_std, problem.q_std)))
+
+    return replace(problem, groups=tuple(map(known, problem.groups)))
 
 
 def with_measured_noise(problem: Problem, result: Fit) -> Problem:

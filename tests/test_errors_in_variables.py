@@ -11,7 +11,7 @@ from ident.derivatives import shared_information, shared_slope
 from ident.errors_in_variables import MOST, information_left, trusted_share
 from ident.extended import predict
 from ident.hypotheses import catalogue
-from ident.identification import set_up
+from ident.identification import identify, set_up
 from ident.inverse import REMAINDER_STEPS
 from ident.model import Effect, Model
 from ident.problem import predictions
@@ -72,10 +72,31 @@ def test_noise_of_the_position_moves_no_parameter(noisy, monkeypatch):
     assert np.sqrt(np.mean(off() ** 2)) > 2.0 and np.abs(off()).max() > 5.0
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_the_noise_that_a_model_passes_on_counts_neither_for_nor_against_it(clean, factor):
-    """Of a stiffer and of a softer gear that is what they are off by without noise, and of plain sums of squares far from it."""
-    problem, periods, j = set_up(clean[0]).problem, 4, 3
+def test_noise_of_the_position_moves_no_parameter_in_a_single_period(ur10, monkeypatch):
+    """The same where the end of a transient alone tells of the noise."""
+    drives = draw_drives(np.random.default_rng(6), ur10)
+    data = run_experiment(small_plan(ur10, 6, periods=2), seed=6, drives=drives, noise=10.0)
+    data = replace(data, q_std=None, tau_std=None)
+    names = ("stiffness", "damping", "motor_inertia", "viscous_friction")
+    truth = np.log(np.concatenate([drives[name] for name in names]))
+
+    def off():
+        setup, found = identify(data)
+        assert all(g.U_periods.shape[1] == 1 for g in setup.problem.groups)
+        return (found.model.par.to_log() - truth) / np.sqrt(np.diag(found.covariance()))[: len(truth)]
+
+    assert np.sqrt(np.mean(off() ** 2)) < 1.3 and np.abs(off()).max() < 4.0
+    monkeypatch.setattr("ident.identification.with_known_noise", lambda problem: problem)
+    assert np.sqrt(np.mean(off() ** 2)) > 2.0
+
+
+@pytest.mark.parametrize("factor, periods", [(0.5, 4), (2.0, 4), (0.5, 1), (2.0, 1)])
+def test_the_noise_that_a_model_passes_on_counts_neither_for_nor_against_it(clean, factor, periods):
+    """Of a stiffer and of a softer gear that is what they are off by without noise, and of plain sums of squares far from it.
+
+    By the scatter between periods, or the noise that is known of one.
+    """
+    problem, j = set_up(clean[0]).problem, 3
     group, rng = next(g for g in problem.groups if g.window is None), np.random.default_rng(1)
     truth = Model(problem.structure, problem.nominal)
     stiffness = np.where(np.arange(problem.structure.n) == j, factor, 1.0) * truth.par.stiffness
@@ -87,6 +108,11 @@ def test_the_noise_that_a_model_passes_on_counts_neither_for_nor_against_it(clea
     U_periods = U[:, None] + 1e-4 * (draw[2] + 1j * draw[3])
     noisy = replace(quiet, Q=Q.mean(axis=1), U=U_periods.mean(axis=1), Q_periods=Q, U_periods=U_periods)
     problem = replace(problem, groups=(noisy,), scatter_share=1.0)
+    if periods == 1:
+        line, unit = (2e-8, 2e-12), np.ones(problem.structure.n)
+        tau_std, q_std = (np.sqrt(x * problem.samples(noisy)) * unit for x in line)
+        noisy = replace(noisy, known_noise=tuple(x * unit for x in line))
+        problem = replace(problem, groups=(noisy,), tau_std=tau_std, q_std=q_std)
     preds = [predictions(problem, m, [None], REMAINDER_STEPS) for m in (truth, wrong)]
     weights = make_weights(problem, preds[0], 0.0)
     off = float(np.sum(np.abs(weights.apply(0, (U - U_wrong)[:, : group.n_compared])) ** 2))
