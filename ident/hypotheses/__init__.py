@@ -9,6 +9,7 @@ import numpy as np
 from ident.chain import Structure
 from ident.hypotheses import bodies, drive, friction, hinges, link_springs, sensing, structure, transmission
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
+from robot_assets.robot import linear_joints
 
 LEAST_DAMPING = 1e-6  # s, of a gear, over its stiffness
 PER_JOINT = (
@@ -28,7 +29,6 @@ PER_JOINT = (
     transmission.transmission_error,
     link_springs.gravity_spring,
     link_springs.dress_pack,
-    sensing.encoder_eccentricity,
     sensing.sensor_delay,
     sensing.sensor_lag,
 )
@@ -46,8 +46,11 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     robot = chain.robot
     names = robot.joint_names
     out: list[Hypothesis] = []
+    linear = linear_joints(robot)
     for j, name in enumerate(names):
         out += [make(j, name) for make in PER_JOINT]
+        if not linear[j]:  # what errs once a turn
+            out.append(sensing.encoder_eccentricity(j, name))
         out.append(transmission.backlash(j, name, max(robot.joints[j].damping / robot.joints[j].stiffness, LEAST_DAMPING)))
         out.append(link_springs.dress_pack(j, name, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
