@@ -30,6 +30,7 @@ from ident.torque_fit import Fit
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
 NEXT_LEAVES = 0.1  # of what the best candidate leaves, that a linear step of another cause may leave of it
+PASSED_ON = 10.0  # share of what a cause explains that errors of its law leave at other joints, over that at its own, at most
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 
@@ -166,13 +167,21 @@ def next_answers(problem: Problem, before: Fit, best: Hypothesis, result: Fit, h
 
 
 def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozenset[int]:
-    """Joints at which next to nothing is left beside what a cause there has explained, all in the noise of the model as it is."""
+    """Joints at which next to nothing is left beside what a cause has explained there, all in the noise of the model as it is.
+
+    Up to ``LAW_ERROR`` of it; where the errors of its law reach other joints, no more than ``PASSED_ON`` times the share at its own.
+    """
     left = current.costs - current.counts
     out = set()
     for found in rounds:
-        j = found.candidates[0].hypothesis.joint
-        if j >= 0 and left[j] < LAW_ERROR * (reweighted(problem, found.before, current.weights).costs[j] - current.costs[j]):
-            out.add(j)
+        h = found.candidates[0].hypothesis
+        if h.joint < 0:
+            continue
+        told = reweighted(problem, found.before, current.weights).costs - current.costs
+        if left[h.joint] < LAW_ERROR * told[h.joint]:
+            out.add(h.joint)
+            share = np.clip(PASSED_ON * left[h.joint] / told[h.joint], 0.0, LAW_ERROR)
+            out |= set() if h.on_chain else set(np.flatnonzero(left < share * told).tolist())
     return frozenset(out)
 
 
