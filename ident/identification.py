@@ -76,6 +76,8 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
         nominal,
         tau_std,
         q_std,
+        # Of a single axis whose torque is held from sample to sample a common offset is a delay of its drive or its sensor.
+        free_timing=robot.n > 1 or dataset.input_hold == "none",
         step_std=step_std,
     )
     if data_count(problem) <= len(nominal.to_log()):

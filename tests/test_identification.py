@@ -246,3 +246,12 @@ def test_the_baseline_is_weighted_by_the_noise_that_it_sees_itself(identified):
     preds = predictions(setup.problem, result.model, result.remainders)
     own = joint_costs(setup.problem, preds, make_weights(setup.problem, preds, 0.0))
     assert joint_costs(setup.problem, preds, result.weights) == pytest.approx(own, rel=0.01)
+
+
+def test_a_common_offset_in_time_is_a_delay_where_there_is_one_joint(clean):
+    """That of its drive or its sensor, if the torque is held; where nothing is said of the hold half a sample may be due to that."""
+    robot = load_robot("twomass")
+    data = run_experiment(small_plan(robot, 4, period=500), seed=4)
+    assert data.input_hold == clean[0].input_hold == "zoh"
+    assert not set_up(data).problem.free_timing
+    assert set_up(replace(data, input_hold="none")).problem.free_timing and set_up(clean[0]).problem.free_timing
