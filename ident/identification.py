@@ -20,8 +20,9 @@ from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps
 from ident.records import build_groups
-from ident.refits import under_own_noise
+from ident.refits import FAINT, under_own_noise
 from ident.rest import difference_noise
+from ident.swings import without_swings
 from ident.torque_fit import Fit
 from robot_assets.errors import DataError
 
@@ -168,6 +169,13 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
         raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
+    as_recorded = setup.problem
+    for _ in range(RENEWALS):
+        # What is missing in a model that is far from the data would be taken off with what swings, as far as a few numbers can do it.
+        if result.chi2_per_dof > FAINT or not np.any(drifting(setup.problem.groups)):
+            break
+        setup = replace(setup, problem=without_swings(as_recorded, result))
+        result = renewed(setup.problem, result, progress)
     problem, held_out = with_known_noise(with_measured_noise(setup.problem, result)), setup.held_out
     if any(g.known_noise is not None for g in problem.groups):
         result = renewed(problem, result, progress)
