@@ -31,6 +31,7 @@ SETTLED = 0.05  # share of the excess up to which what is left needs no second s
 NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
 NEXT_LEAVES = 0.1  # of what the best candidate leaves, that a linear step of another cause may leave of it
 PASSED_ON = 10.0  # share of what a cause explains that errors of its law leave at other joints, over that at its own, at most
+TOLD_AT_LEAST = 1e-9  # fall of the cost, of causes that bring none at a joint
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
 
@@ -177,7 +178,7 @@ def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozense
         h = found.candidates[0].hypothesis
         if h.joint < 0:
             continue
-        told = reweighted(problem, found.before, current.weights).costs - current.costs
+        told = np.maximum(reweighted(problem, found.before, current.weights).costs - current.costs, TOLD_AT_LEAST)
         if left[h.joint] < LAW_ERROR * told[h.joint]:
             out.add(h.joint)
             share = np.clip(PASSED_ON * left[h.joint] / told[h.joint], 0.0, LAW_ERROR)
