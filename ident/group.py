@@ -46,6 +46,8 @@ class Group:
             period has no scatter (``ends_of_transients``); or None.
         known_noise: (n,) variances of a line of torque and position by white noise, N2 m2 and rad2, of a single period of which they are
             measured; or None.
+        rounding: (K, n) variance of a line of the mean position by the steps of its encoder, rad2, which repeats with the motion and
+            does not average out over periods; or None.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -78,6 +80,7 @@ class Group:
     U_noise: np.ndarray | None = None
     Q_noise: np.ndarray | None = None
     known_noise: tuple[np.ndarray, np.ndarray] | None = None
+    rounding: np.ndarray | None = None
 
     @property
     def shows_noise(self) -> bool:

@@ -18,7 +18,7 @@ from ident.inverse import Sampling
 from ident.noise import DOUBT, drifting, sample_noise, torque_noise_left, unexcited_noise, white_covariance
 from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
-from ident.quantization import Steps, find_steps
+from ident.quantization import Steps, find_steps, with_rounding
 from ident.records import build_groups
 from ident.refits import FAINT, under_own_noise
 from ident.rest import difference_noise
@@ -68,18 +68,16 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     q_std, tau_std = _noise(dataset)
     declared = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
     steps = find_steps(dataset, declared) if np.all(declared > 0) else ()
-    step_std = np.zeros(robot.n)
-    step_std[[x.joint for x in steps]] = [x.resolution / np.sqrt(12.0) for x in steps]
+    compared, held_out = (with_rounding(x, steps, dataset) for x in (multisines or groups, held_out))
     problem = Problem(
         structure,
-        multisines or groups,
+        compared,
         Sampling(1.0 / dataset.sample_rate, dataset.input_hold),
         nominal,
         tau_std,
         q_std,
         # Of a single axis whose torque is held from sample to sample a common offset is a delay of its drive or its sensor.
         free_timing=robot.n > 1 or dataset.input_hold == "none",
-        step_std=step_std,
     )
     if data_count(problem) <= len(nominal.to_log()):
         found = f"{data_count(problem)} numbers to compare"

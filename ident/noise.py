@@ -240,7 +240,10 @@ def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 def drifting(groups: Sequence[Group]) -> np.ndarray:
-    """Joints (n,) at which nearly all that differs between periods, of the torque or of the position in some band, is a drift."""
+    """Joints (n,) at which nearly all that differs between periods, of the torque or of the position in some band, is a drift.
+
+    Of a drive that hunts between the steps of its encoder, in pulses that go together in all lines, nothing is told.
+    """
     measured = [g for g in groups if g.window is None and g.U_periods.shape[1] > 1]
     out = np.zeros(groups[0].U.shape[-1], bool)
     if not measured:
@@ -248,4 +251,6 @@ def drifting(groups: Sequence[Group]) -> np.ndarray:
     for channel in ("U_periods", "Q_periods"):
         together, count = line_coherence([getattr(g, channel)[:, :, 1 : g.n_compared] for g in measured])
         out |= np.any((together > TOGETHER) & (together * np.sqrt(count)[:, None] > NO_CHANCE), axis=0)
+    for g in measured:
+        out &= True if g.rounding is None else ~np.any(g.rounding, axis=0)
     return out

@@ -29,8 +29,6 @@ class Problem:
         nominal: starting guesses, centre of the weak prior.
         tau_std, q_std: (n,) sample noise where single periods give no scatter.
         free_timing: whether a common timing offset is fitted.
-        step_std: (n,) rounding error of position in steps, rad; it repeats with the motion and does
-            not average out over periods.
         scatter_share: of what the scatter between periods says that noise adds to costs, that is taken off where these are
             compared; that which the baseline has borne, none before it is known.
     """
@@ -42,7 +40,6 @@ class Problem:
     tau_std: np.ndarray
     q_std: np.ndarray
     free_timing: bool = True
-    step_std: np.ndarray | float = 0.0
     scatter_share: float = 0.0
 
     @property

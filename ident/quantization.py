@@ -6,12 +6,15 @@ show: they hold its error as a floor at all lines.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
 
 from ident.dataset import Dataset
+from ident.group import NOISE_LINES, Group, mean_over_lines
+from ident.transients import LEAKED
 
 COARSE = 1.5  # rounding error over the sample noise from which steps are an effect
 SAMPLES = 4000  # looked at per joint
@@ -20,6 +23,8 @@ STRETCH = 400.0  # half the positions in which steps blurred by noise are looked
 ON_GRID = 0.02  # distance from the grid, in steps, of samples that lie on it
 LEAST_CELLS = 20  # steps that the motion must span
 CELLS_PER_STEP = 8  # of the histogram of positions, in the least step
+CLEAR = 10.0  # power of a line over that of white rounding errors, above which it is motion
+SIZES = (0.8, 0.9, 1.1, 1.2)  # of a motion over that which is recorded, at which it is rounded once more
 CONTRAST = 0.35  # of the sum over samples of exp(2 pi j q / step), relative to its largest value
 
 
@@ -49,6 +54,58 @@ def find_steps(dataset: Dataset, q_std: np.ndarray) -> tuple[Steps, ...]:
         if found is not None and found[0] / np.sqrt(12.0) > COARSE * q_std[j]:
             out.append(Steps(j, *found))
     return tuple(out)
+
+
+def with_rounding(groups: Sequence[Group], steps: Sequence[Steps], dataset: Dataset) -> tuple[Group, ...]:
+    """Groups with the error that steps leave in their positions (``rounding_error``), less what scatters between periods as noise does."""
+    if not steps:
+        return tuple(groups)
+    segments = {s.name: s for s in dataset.segments}
+    out = []
+    for group in groups:
+        samples = round(group.period_time * dataset.sample_rate)
+        rounding = np.zeros((group.n_compared, dataset.n))
+        for x in steps:
+            # Where the steps lie is told by each group itself: over many of them small errors of one add up.
+            recorded = np.concatenate([segments[name].q[:, x.joint] for name in group.segments])
+            at = x.resolution * np.angle(np.mean(np.exp(2j * np.pi * recorded / x.resolution))) / (2 * np.pi)
+            error = rounding_error(group.Q[:, :, x.joint], x.resolution, at, samples, group.n_compared)
+            rounding[:, x.joint] = error * max(1.0 - _varying(group, x.joint) / error.mean(), 0.0)
+        out.append(replace(group, rounding=rounding))
+    return tuple(out)
+
+
+def rounding_error(Q: np.ndarray, step: float, at: float, samples: int, lines: int) -> np.ndarray:
+    """Variance (lines,) of a line of a position that comes in steps, rad2; mean over records.
+
+    It is white with ``step^2 / 12`` where samples are many steps apart (Widrow and Kollar 2008, ch. 19). Slow motion holds the low lines,
+    and motion with odd lines alone about the middle of a step the odd ones: the motion itself, its lines that stand out of such
+    errors, is rounded once more, and the power of what that changes taken in the mean over lines near by, even and odd ones apart. As the
+    motion holds errors of its own, which would not be made again, it is made smaller and larger.
+
+    Args:
+        Q: (S, L) spectra of the position, rad.
+        at: where a step lies, rad.
+    """
+    white = step**2 / 12.0 / samples
+    motion = np.where(np.abs(Q) ** 2 > CLEAR * white, Q, 0.0)[:, : samples // 2 + 1]
+    motion[:, 0] = 0.0
+    cells = scipy.fft.irfft(motion * samples, samples, axis=1) / step
+    if np.ptp(cells, axis=1).max() < 1.0:
+        return np.full(lines, white)
+    cells = np.concatenate([x * cells + (Q[:, :1].real - at) / step for x in SIZES])
+    error = step * (np.round(cells) - cells)
+    power = np.mean(np.abs(scipy.fft.rfft(error, axis=1, norm="forward")[:, :lines]) ** 2, axis=0)
+    for first in (0, 1):
+        power[first::2] = mean_over_lines(power[first::2], NOISE_LINES)
+    return power * white * samples / np.mean(error**2)
+
+
+def _varying(group: Group, joint: int) -> float:
+    """Variance of a line of the position that differs from period to period, in the mean over the compared ones."""
+    if group.U_periods.shape[1] > 1:
+        return float(np.mean(np.var(group.Q_periods[:, :, 1 : group.n_compared, joint], axis=1, ddof=1)))
+    return 0.0 if group.Q_noise is None else float(np.mean(np.abs(group.Q_noise[:, LEAKED:, joint]) ** 2))
 
 
 def _exact_grid(q: np.ndarray) -> tuple[float, float] | None:

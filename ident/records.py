@@ -163,9 +163,16 @@ def without_creep(x: np.ndarray) -> np.ndarray:
     width = min(BORDER_SAMPLES, N)
     # From the start of the first period to that of the second, and from the end of the first to that of the last.
     jump = (x[1] - x[0])[:width].mean(axis=0) + (x[-1] - x[0])[-width:].mean(axis=0)
-    noise = 2.0 * difference_noise(x.reshape(P * N, -1)) / np.sqrt(width)
+    noise = np.maximum(2.0 * difference_noise(x.reshape(P * N, -1)) / np.sqrt(width), _change(x[-1] - x[0], width))
     at = np.arange(P * N).reshape(P, N, 1) - 0.5 * (P * N - 1)
     return x - at * np.where(np.abs(jump) > CREEP * noise, jump, 0.0) / (P * N)
+
+
+def _change(x: np.ndarray, width: int) -> np.ndarray:
+    """(n,) rms of what the mean of so many samples of (N, n) changes by from each to the next: that of a drive that hunts
+    between the steps of an encoder is far more than differences of single samples show, most of which are small."""
+    means = x[: len(x) // width * width].reshape(-1, width, x.shape[1]).mean(axis=1)
+    return np.sqrt(np.mean(np.diff(means, axis=0) ** 2, axis=0)) if len(means) > 1 else np.zeros(x.shape[1])
 
 
 def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from ident.quantization import _blurred_grid, _exact_grid
+from ident.dataset_io import load_dataset, save_dataset
+from ident.excitation import operating_points
+from ident.identification import identify
+from ident.noise import drifting
+from ident.quantization import _blurred_grid, _exact_grid, rounding_error
+from robot_assets.robot import load_robot
+from sim import run_experiment
+from sim.effects import EFFECTS
+from sim.experiment import plan_experiment
 
 
 def motion(rng, N=4000):
@@ -27,3 +35,56 @@ def test_a_smooth_position_with_noise_has_no_steps(seed):
     rng = np.random.default_rng(seed)
     q = motion(rng) + 3e-6 * rng.normal(size=4000)
     assert _exact_grid(q) is None and _blurred_grid(q, 3e-6) is None
+
+
+def lines_of_rounding(cells, middle, slope):
+    """Power of the error of odd multisines of so many steps about one place in a step, over that of white errors: what it is, and as
+    it is foretold from the rounded record; (2, top)."""
+    rng = np.random.default_rng(3)
+    N, top, step, draws = 4000, 280, 1e-4, 40
+    odd = np.arange(3, top, 2)
+    at = 0.7
+    actual, foretold = np.zeros(top), np.zeros(top)
+    for _ in range(draws):
+        X = np.zeros((1, 2 * top), complex)
+        X[0, odd] = np.exp(2j * np.pi * rng.random(len(odd))) / odd**slope
+        X *= cells * step / np.ptp(np.fft.irfft(X * N, N))
+        X[0, 0] = at + middle * step
+        q = np.fft.irfft(X * N, N, axis=1) + 0.05 * step * rng.normal(size=(1, N))
+        lines = np.fft.rfft(np.round((q - at) / step) * step + at, norm="forward")
+        actual += np.abs(lines[0, :top] - X[0, :top]) ** 2
+        foretold += rounding_error(lines[:, : 2 * top], step, at, N, top)
+    return np.stack([actual, foretold]) / (draws * step**2 / 12 / N)
+
+
+@pytest.mark.parametrize(("cells", "middle", "slope"), [(9.0, 0.0, 0.5), (20.0, 0.25, 1.0), (60.0, 0.13, 1.0), (60.0, 0.13, 0.5)])
+def test_what_steps_leave_in_lines_is_foretold_from_the_rounded_motion(cells, middle, slope):
+    both = lines_of_rounding(cells, middle, slope)
+    for band in (slice(5, 60), slice(60, 280)):
+        actual, foretold = both[:, band].mean(axis=1)
+        assert foretold == pytest.approx(actual, rel=0.25)
+
+
+def test_about_the_middle_of_a_step_the_odd_lines_hold_the_errors():
+    for power in lines_of_rounding(9.0, 0.0, 0.5):
+        assert power[5:280:2].mean() > 5 * power[6:280:2].mean()
+
+
+def test_a_joint_within_one_step_has_white_errors():
+    Q = np.zeros((2, 50), complex)
+    Q[:, 0] = 0.7
+    assert rounding_error(Q, 1e-4, 0.7, 4000, 20) == pytest.approx(np.full(20, 1e-8 / 12 / 4000))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_beside_an_encoder_in_steps_nothing_is_left_but_noise(tmp_path, seed):
+    """A loop that hunts between steps of 45 times the encoder's noise, at two levels: chi-square stays that of noise."""
+    robot = load_robot("ur10")
+    plan = plan_experiment(
+        robot, operating_points(robot, 2, np.random.default_rng(seed)), points=2, seed=seed, levels=(1.0, 0.4), period=4000
+    )
+    hidden = EFFECTS["encoder_quantization"](place="shoulder_lift_joint", resolution=9e-5)
+    save_dataset(run_experiment(plan, [hidden], seed=seed), tmp_path / "d")
+    setup, fit = identify(load_dataset(tmp_path / "d"))
+    assert [s.joint for s in setup.steps] == [1]
+    assert 0.85 < fit.chi2_per_dof < 1.15 and not np.any(drifting(setup.problem.groups))

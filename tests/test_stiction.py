@@ -193,6 +193,13 @@ def test_a_motor_that_creeps_is_periodic_but_for_a_line(creep):
     assert (y - y[:1]).mean(axis=(1, 2)) == pytest.approx(np.zeros(P), abs=0.01 * 3e-4)
 
 
+def test_a_drive_that_hunts_between_steps_of_its_encoder_does_not_creep():
+    """Pulses here and there, of which some fall on the ends of the periods: most differences of samples are small."""
+    rng, P, N = np.random.default_rng(2), 3, 4000
+    x = 0.01 * rng.normal(size=(P, N, 1)) + 20.0 * (rng.random((P, N, 1)) < 0.1) * rng.choice([-1.0, 1.0], size=(P, N, 1))
+    assert np.array_equal(without_creep(x), x)
+
+
 def test_what_is_held_hangs_on_few_parameters(monkeypatch):
     """Columns beside dry friction, against differences: far nearer to these than those of a motor that nothing holds."""
     problem, model = friction("coulomb_friction", [COULOMB, 0.1, 1e-4])
