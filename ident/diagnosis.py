@@ -136,7 +136,7 @@ def diagnose_fully(
             evidence_plot(problem, result.final, last, effect, i)
             for i, effect in enumerate(named_effects(result.final))
         ),
-        traces=torque_traces(dataset, shown, pairs),
+        traces=torque_traces(shown, pairs),
         parameters={k: v.value for k, v in verdict.baseline.items()},
         seconds=time.perf_counter() - began,
         next_plan=separating.plan if separating else None,

@@ -22,7 +22,8 @@ from robot_assets.errors import DataError
 from robot_assets.robot import linear_joints
 
 BANDS = 8
-SHOWN_SECONDS = 6.0
+SHOWN_SECONDS = 6.0  # of a period
+SHOWN_WEIGHT = 0.99  # of the window of a motion, from which it is shown
 
 
 def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.05) -> tuple[Where, ...]:
@@ -119,10 +120,8 @@ def with_torque(dataset: Dataset, problem: Problem, predictions: Sequence[Predic
     return replace(dataset, segments=tuple(replaced(s) for s in dataset.segments))
 
 
-def torque_traces(
-    dataset: Dataset, groups: Sequence[Group], pairs: Sequence[tuple[Prediction, Prediction]]
-) -> tuple[TorqueTrace, ...]:
-    """Measured and predicted torque in time, for the first segment of each group."""
+def torque_traces(groups: Sequence[Group], pairs: Sequence[tuple[Prediction, Prediction]]) -> tuple[TorqueTrace, ...]:
+    """Measured and predicted torque in time, for the first segment of each group; of a motion without its ends, which are not compared."""
     out = []
     for group, (a, b) in zip(groups, pairs, strict=True):
         signals = []
@@ -133,15 +132,9 @@ def torque_traces(
         t = np.arange(group.n_time) * group.period_time / group.n_time
         show = t <= SHOWN_SECONDS
         if group.window is not None:
-            first = dataset_segment(dataset, group.segments[0])
-            show = t <= first.t[-1] - first.t[0]
+            show = group.window >= SHOWN_WEIGHT
         out.append(TorqueTrace(group.segments[0], t[show], *(s[show] for s in signals)))
     return tuple(out)
-
-
-def dataset_segment(dataset: Dataset, name: str):
-    """Segment by name."""
-    return next(s for s in dataset.segments if s.name == name)
 
 
 LABELS = {
