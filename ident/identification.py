@@ -284,12 +284,8 @@ def with_known_noise(problem: Problem) -> Problem:
 
 def with_measured_noise(problem: Problem, result: Fit) -> Problem:
     """Sample noise from the scatter between periods, for records that have a single one."""
-    levels = []
-    for group, pred in zip(problem.groups, predictions(problem, result.model, result.remainders), strict=True):
-        found = sample_noise(group, pred.sampled_impedance, problem.samples(group))
-        if found is not None:
-            levels.append(found)
-    if not levels:
+    impedances = [p.sampled_impedance for p in predictions(problem, result.model, result.remainders)]
+    levels = sample_noise(problem.groups, impedances, [problem.samples(g) for g in problem.groups])
+    if levels is None:
         return problem
-    tau, q = (np.median([level[i] for level in levels], axis=0) for i in range(2))
-    return replace(problem, tau_std=np.maximum(tau, 1e-6), q_std=np.maximum(q, 1e-10))
+    return replace(problem, tau_std=np.maximum(levels[0], 1e-6), q_std=np.maximum(levels[1], 1e-10))

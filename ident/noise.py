@@ -19,6 +19,7 @@ PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around i
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
 WINDOWED = 2.0  # neighbouring lines of a spectrum through a window, that count as one
 LEVEL_STEPS = 60  # towards the likeliest levels
+LEVELS, LEAST_LEVEL, MOST_LEVEL = 400, 1e-5, 1e5  # of the noise of the torque, over the quietest line, between which it is sought
 LEAST_VARIANCE = 1e-140  # of a line, of records without any noise
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
@@ -67,7 +68,7 @@ def residual_covariance(
         return S[: group.n_compared]
     d, lines, dof_line = found
     Zk = Z[: group.n_compared]
-    tau_var, q_var = _white_levels(np.sum(np.abs(d) ** 2, axis=0), Zk[lines])
+    tau_var, q_var = group.known_noise or _white_levels(np.sum(np.abs(d) ** 2, axis=0), Zk[lines], dof_line)
     S = white_covariance(Zk, tau_var, q_var)
     root = np.linalg.cholesky(S)
     white = np.linalg.solve(root[lines][None], d[..., None])[..., 0]
@@ -100,45 +101,81 @@ def _scatter(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float
     return d / np.sqrt(len(d)), lines, len(d) / WINDOWED
 
 
-def sample_noise(group: Group, Z: np.ndarray, samples: int) -> tuple[np.ndarray, np.ndarray] | None:
+def sample_noise(groups: Sequence[Group], impedances: Sequence[np.ndarray], samples: Sequence[int]) -> tuple[np.ndarray, np.ndarray] | None:
     """Standard deviation of white noise on torque and position samples, (n,) each.
 
-    From what shows the noise of the torque residual alone (``_scatter``); None where nothing does.
+    From what shows the noise of the torque residual alone (``_scatter``), in all groups together; None where nothing does.
+
+    Args:
+        impedances: (L, n, n) recorded torque per motor position, by group.
+        samples: per period, by group.
     """
-    found = _scatter(group, Z)
-    if found is None:
+    power, gains, dof = [], [], []
+    for group, Z, count in zip(groups, impedances, samples, strict=True):
+        found = _scatter(group, Z)
+        if found is None:
+            continue
+        d, lines, dof_line = found
+        power.append(count * group.U_periods.shape[1] * np.sum(np.abs(d[:, 1:]) ** 2, axis=0))
+        gains.append(Z[lines[1:]])
+        dof.append(np.full(len(lines) - 1, dof_line))
+    if not power:
         return None
-    d, lines, _ = found
-    power = group.U_periods.shape[1] * np.sum(np.abs(d) ** 2, axis=0)
-    tau_var, q_var = _white_levels(power, Z[lines])
-    return np.sqrt(tau_var * samples), np.sqrt(q_var * samples)
+    levels = _white_levels(*(np.concatenate([x[:1], *parts]) for x, parts in ((p[0], p) for p in (power, gains, dof))))
+    return np.sqrt(levels[0]), np.sqrt(levels[1])
 
 
-def _white_levels(power: np.ndarray, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Channel variances, (n,) each, that are likeliest of the line power (K, n) of the residual.
+def _white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Channel variances, (n,) each, of the line power (K, n) of the residual; the first line is left out.
 
-    Powers of lines of noise are exponential about their mean ``m``: ``sum(log m + power / m)`` is least (Whittle 1953), by
-    multiplicative steps, under which variances stay positive (Fevotte, Bertin and Durrieu, Neural Comput. 21, 2009, eq. 4.7).
+    Few lines may be likeliest without any noise of the torque: beside the likeliest noise of the positions its mean over all levels
+    that are likely is taken.
+
+    Args:
+        dof: degrees of freedom of each line, (K,) or of all.
 
     Raises:
         FloatingPointError: power or gain without bounds.
     """
     if not (np.all(np.isfinite(power)) and np.all(np.isfinite(Z))):
         raise FloatingPointError("noise without bounds")
+    floor = 1e-12 * np.maximum(power.mean(axis=0), 1e-300)
+    power, gain = np.maximum(power, LEAST_VARIANCE)[1:], np.abs(Z[1:]) ** 2
+    weight = np.broadcast_to(np.reshape(dof, (-1, 1)), (len(Z), 1))[1:]
+    q_var = likeliest_levels(power, gain, weight)[1]
+    return _mean_level(power, gain @ q_var, weight) + floor, q_var + 1e-12 * floor
+
+
+def likeliest_levels(power: np.ndarray, gain: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of torque and position, (n,) each, that are likeliest of the line power (K, n) of ``torque + gain @ position``.
+
+    Powers of lines of noise are gamma distributed about their mean ``m``: ``sum(weight (log m + power / m))`` is least (Whittle 1953), by
+    multiplicative steps, under which variances stay positive (Fevotte, Bertin and Durrieu, Neural Comput. 21, 2009, eq. 4.7).
+
+    Args:
+        gain: (K, n, n); weight: (K, 1) degrees of freedom.
+    """
     n, k = power.shape[1], np.arange(power.shape[1])
     columns = np.zeros((len(power), n, 2 * n))
     columns[:, k, k] = 1.0
-    columns[:, :, n:] = np.abs(Z) ** 2
-    floor = 1e-12 * np.maximum(power.mean(axis=0), 1e-300)
-    A = columns[1:].reshape(-1, 2 * n)
-    b = np.maximum(power, LEAST_VARIANCE)[1:].ravel()
-    own = np.maximum(np.diagonal(columns[1:, :, n:], axis1=1, axis2=2), 1e-300)
-    level = np.concatenate([np.median(power[1:], axis=0), np.median(power[1:] / own, axis=0)])
-    level = np.maximum(level, LEAST_VARIANCE)
+    columns[:, :, n:] = gain
+    A, b, w = columns.reshape(-1, 2 * n), power.ravel(), np.broadcast_to(weight, power.shape).ravel()
+    own = np.maximum(np.diagonal(gain, axis1=1, axis2=2), 1e-300)
+    level = np.maximum(np.concatenate([np.median(power, axis=0), np.median(power / own, axis=0)]), LEAST_VARIANCE)
     for _ in range(LEVEL_STEPS):
         inverse = 1.0 / np.maximum(A @ level, LEAST_VARIANCE)
-        level = level * (A.T @ (b * inverse**2)) / np.maximum(A.T @ inverse, 1e-300)
-    return level[:n] + floor, level[n:] + 1e-12 * floor
+        level = level * (A.T @ (w * b * inverse**2)) / np.maximum(A.T @ (w * inverse), 1e-300)
+    return level[:n], level[n:]
+
+
+def _mean_level(power: np.ndarray, others: np.ndarray, dof: np.ndarray) -> np.ndarray:
+    """Mean (n,) over all levels of the torque noise, each as likely as it makes the power (K, n) of lines that hold other noise too."""
+    least = np.maximum(np.min(power, axis=0), LEAST_VARIANCE)
+    level = least * np.geomspace(LEAST_LEVEL, MOST_LEVEL, LEVELS)[:, None]
+    mean = level[:, None] + others
+    likely = -np.sum(dof * (np.log(mean) + power / mean), axis=1) + np.log(level)
+    share = np.exp(likely - likely.max(axis=0))
+    return np.sum(share * level, axis=0) / np.sum(share, axis=0)
 
 
 def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:

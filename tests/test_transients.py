@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ident.identification import identify, set_up
-from ident.noise import LEVEL_STEPS, _white_levels
+from ident.noise import LEVEL_STEPS, _white_levels, likeliest_levels
 from ident.transients import ends_of_transients
 
 PERIOD, TOP, STD = 4000, 300, 2e-3
@@ -65,17 +65,31 @@ def test_the_likeliest_levels_are_those_of_the_noise(torque, lines):
     for _ in range(20):
         expected = tau + np.einsum("kij,j->ki", np.abs(gain) ** 2, q)
         power = expected * rng.gamma(8.0, 1.0 / 8.0, size=expected.shape)
-        errors.append(np.concatenate(_white_levels(power, gain)) / np.concatenate([tau, q]) - 1.0)
+        errors.append(np.concatenate(_white_levels(power, gain, 8.0)) / np.concatenate([tau, q]) - 1.0)
     assert np.abs(np.mean(errors, axis=0)).max() < 0.1
     # Eight degrees of freedom a line, and a third of the lines or more hold each.
     assert np.std(errors, axis=0).max() < 2.0 / np.sqrt(8.0 * lines / 3.0)
+
+
+def test_few_lines_are_not_told_to_hold_no_noise():
+    """Of 14 lines of one record three hold more noise of the torque than of the position: likeliest may be a hundredth of it, or none."""
+    rng = np.random.default_rng(7)
+    gain = np.geomspace(0.5, 30.0, 14)[:, None, None]
+    likeliest, taken = [], []
+    for _ in range(300):
+        power = (1.0 + gain[:, 0] ** 2) * rng.exponential(size=(14, 1))
+        likeliest.append(likeliest_levels(power[1:], gain[1:] ** 2, np.ones((13, 1)))[0][0])
+        taken.append(_white_levels(power, gain, 1.0)[0][0])
+    assert np.quantile(likeliest, 0.05) < 0.02
+    assert np.quantile(taken, 0.005) > 0.1
+    assert 0.7 < np.median(taken) < 3.0  # its mean is that of a long tail
 
 
 def test_the_levels_have_settled():
     rng = np.random.default_rng(2)
     gain = np.geomspace(1e-3, 1e2, 200)[:, None, None] * np.eye(2)
     power = (1.0 + np.einsum("kij->ki", gain**2)) * rng.exponential(size=(200, 2))
-    more = [np.concatenate(_white_levels(power, gain))]
+    level = np.concatenate(likeliest_levels(power[1:], gain[1:] ** 2, np.ones((199, 1))))
 
     def slope(level):
         """Of the negative log-likelihood by the logarithms of the levels, over the number of lines."""
@@ -83,7 +97,7 @@ def test_the_levels_have_settled():
         by_mean = (1.0 / m - power / m**2)[1:]
         return np.concatenate([np.sum(by_mean * level[:2], axis=0), np.sum(by_mean * np.einsum("kij->ki", gain[1:] ** 2) * level[2:], axis=0)]) / 200
 
-    assert LEVEL_STEPS >= 30 and np.abs(slope(more[0])).max() < 1e-4
+    assert LEVEL_STEPS >= 30 and np.abs(slope(level)).max() < 1e-4
 
 
 @pytest.mark.parametrize("silent", [[0], [1], [0, 1]])
@@ -91,14 +105,14 @@ def test_records_without_noise_have_none(silent):
     gain = np.geomspace(1e-3, 1e2, 100)[:, None, None] * np.eye(2)
     power = np.random.default_rng(3).exponential(size=(100, 2))
     power[:, silent] = 0.0
-    tau, q = _white_levels(power, gain)
+    tau, q = _white_levels(power, gain, 1.0)
     assert np.all(np.isfinite([tau, q])) and np.all(tau > 0.0) and np.all(q > 0.0)
     assert np.all(tau[silent] < 1e-20) and np.all(q[silent] < 1e-20)
 
 
 def test_noise_without_bounds_is_refused():
     with pytest.raises(FloatingPointError, match="without bounds"):
-        _white_levels(np.full((20, 2), np.inf), np.ones((20, 2, 2)))
+        _white_levels(np.full((20, 2), np.inf), np.ones((20, 2, 2)), 1.0)
 
 
 @pytest.fixture(scope="module")
