@@ -29,7 +29,7 @@ from ident.torque_fit import Fit
 
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 SAME_PERIOD = 0.01  # relative, of two ripples
-REMATCH = 0.02  # probability from which a rival is weighed against a cause again at the end
+REMATCH = 0.002  # probability from which a rival is weighed against a cause again at the end
 
 
 def weighed_again(

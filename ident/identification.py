@@ -135,10 +135,15 @@ def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) 
 
 
 def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Sample noise of position and torque: as given, else from fourth differences of the data."""
+    """Sample noise of position and torque: as given, else from fourth differences of the data.
+
+    A torque that is not held from sample to sample may be made by a faster loop, of which the record holds single samples: what circulates
+    there folds into all lines, and is noise beside that which is given.
+    """
     out = []
     for given, channel in ((dataset.q_std, "q"), (dataset.tau_std, "tau")):
-        if given is not None and np.all(given > 0):
+        known = given is not None and np.all(given > 0)
+        if known and (channel == "q" or dataset.input_hold == "zoh"):
             out.append(np.asarray(given, float))
         else:
             signals = [getattr(s, channel) for s in dataset.segments]
@@ -148,7 +153,10 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 def least_noise(dataset: Dataset, channel: str) -> np.ndarray:
-    """(n,) noise of the samples of a channel that is taken at least, rad or N m."""
+    """(n,) noise of the samples of a channel that is taken at least, rad or N m: as given, else a small share of its signal."""
+    given = dataset.q_std if channel == "q" else dataset.tau_std
+    if given is not None and np.all(given > 0):
+        return np.asarray(given, float)
     size = np.median([np.std(getattr(s, channel), axis=0) for s in dataset.segments], axis=0)
     return np.maximum(LEAST_NOISE[channel] * size, 1e-9 if channel == "q" else 1e-6)
 
@@ -240,8 +248,9 @@ def under_noise_beside_causes(
 
 
 def guessed_noise(dataset: Dataset) -> list[bool]:
-    """Whether the noise of position and of torque are not given."""
-    return [not (given is not None and np.all(given > 0)) for given in (dataset.q_std, dataset.tau_std)]
+    """Whether the noise of position and of torque are not given, or as ``_noise`` says not all that there is."""
+    q_known, tau_known = (given is not None and np.all(given > 0) for given in (dataset.q_std, dataset.tau_std))
+    return [not q_known, not tau_known or np.any(_noise(dataset)[1] > np.sqrt(LOUD) * dataset.tau_std)]
 
 
 def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
