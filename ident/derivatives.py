@@ -118,16 +118,18 @@ def _differences(
     along = joints_along_record(model, group)
     gears = {e.hypothesis.joint for e in model.effects if e.hypothesis.gear_law}
     steps = {f * n + j: BASELINE_STEP for j in gears for f in range(4 if j in along else 2)}
-    if exact:
-        steps |= dict.fromkeys(np.flatnonzero(moves_links(model)[:m]).tolist(), BASELINE_STEP)
+    anew = dict.fromkeys(np.flatnonzero(moves_links(model)[:m]).tolist() if exact else range(n) if group.window is not None else (), BASELINE_STEP)
+    steps |= anew
     if along:
         steps[m] = TIMING_STEP
     x = pack(model)
 
     def column(c: int, step: float) -> np.ndarray:
         there = unpack(model, x + step * (np.arange(len(x)) == c), np.inf)
-        return _change(group, _again(problem, there, group, pred, int(exact)), now, posture) / step
+        base = now if exact or c not in anew else settled
+        return _change(group, _again(problem, there, group, pred, int(c in anew)), base, posture) / step
 
+    settled = _again(problem, model, group, pred, 1) if anew and not exact else now
     return {c: column(c, step) for c, step in steps.items()}
 
 
@@ -178,7 +180,8 @@ def _effect_columns(
         Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
         for p, _ in steps
     ]
-    if exact or h.channel == "model":
+    # Along a motion what shifts the position shifts gravity and inertia with it.
+    if exact or h.channel == "model" or (h.channel == "position" and group.window is not None):
         base, posture = now if exact else _again(problem, model, group, pred, 1), None
         moved = [_again(problem, m, group, pred, 1) for m in models]
     else:

@@ -22,7 +22,7 @@ from ident.transients import ends_of_transients
 from robot_assets.errors import DataError
 
 RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: what still rings then has decayed
-SETTLE_TIME = 0.5  # s, tapered at both ends of a motion
+SETTLE_TIME, SETTLE_PERIODS = 0.5, 2.0  # tapered at both ends of a motion: s, and periods of the highest compared frequency, at least
 BORDER_SAMPLES = 8  # at either end of a period, from which it is told where it begins and ends
 CREEP = 6.0  # standard deviations of their noise, by which both must differ
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
@@ -194,7 +194,8 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
     fine = min(N, scipy.fft.next_fast_len(int(MOTION_RATE * N / fs), real=True))
     n_time = max(fine, scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True))
     time = np.arange(n_time) * N / fs / n_time
-    ramp = min(SETTLE_TIME, 0.1 * len(segment.t) / fs)
+    # What is beyond the band at the ends, where the record breaks off, reaches as far into it as the band is narrow.
+    ramp = min(max(SETTLE_TIME, SETTLE_PERIODS / band_hz), 0.1 * len(segment.t) / fs)
     end = len(segment.t) / fs
     window = np.clip(time / ramp, 0, 1) * np.clip((end - time) / ramp, 0, 1)
     window = np.sin(0.5 * np.pi * window) ** 2

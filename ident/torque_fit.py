@@ -193,8 +193,9 @@ def fit(
     if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
-    # The remainder holds the gravity torque of the chain, at one posture: what changes either needs a new one.
-    anew = (shifts_posture(model) and not problem.motions_alone) or any(e.hypothesis.channel == "model" for e in model.effects)
+    # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a new one.
+    changing = ("model", "position") if problem.motions_alone else ("model",)
+    anew = (shifts_posture(model) and not problem.motions_alone) or any(e.hypothesis.channel in changing for e in model.effects)
     moves, drift = moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False
