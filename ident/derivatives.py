@@ -109,7 +109,7 @@ def _differences(
     exact: bool,
     posture: np.ndarray | None,
 ) -> dict[int, np.ndarray]:
-    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` the links, by differences from ``now``.
+    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` and along motions the links, by differences.
 
     These laws move with the gear's spring and damper; and where the recorded torque says its deflection, with what
     the motor takes of that, and with the timing.
@@ -118,7 +118,9 @@ def _differences(
     along = joints_along_record(model, group)
     gears = {e.hypothesis.joint for e in model.effects if e.hypothesis.gear_law}
     steps = {f * n + j: BASELINE_STEP for j in gears for f in range(4 if j in along else 2)}
-    anew = dict.fromkeys(np.flatnonzero(moves_links(model)[:m]).tolist() if exact else range(n) if group.window is not None else (), BASELINE_STEP)
+    # Along a motion softer gears move gravity and inertia too; link encoders show the links themselves.
+    along_motion = range(n) if group.window is not None and not group.links else ()
+    anew = dict.fromkeys(np.flatnonzero(moves_links(model)[:m]).tolist() if exact else along_motion, BASELINE_STEP)
     steps |= anew
     if along:
         steps[m] = TIMING_STEP

@@ -8,13 +8,13 @@ weights gives (score test, Rao 1948; theory.md 9.3). Only normal matrices are ke
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.coordinates import prior_of
 from ident.derivatives import as_real, jacobian
-from ident.extended import Prediction
+from ident.extended import Prediction, predict
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.motion import Motion
 from ident.parallel import map_threads
@@ -23,6 +23,8 @@ from ident.posture import moved_by_gears
 from ident.problem import Problem, output_error
 from ident.torque_fit import RIDGE, Fit
 from ident.torque_fit import inverse as steadied_inverse
+
+SHIFT = 1e-4  # rad or m, of a position along which a motion is predicted once more
 
 
 @dataclass(frozen=True)
@@ -216,6 +218,8 @@ def _score(
                 parts.append(("motor", _lines(motion, made.motor)))
             if group.window is None:
                 sums = _line_sums([(fields[g][c], X[:, : group.n_compared]) for c, X in parts])
+            elif h.channel == "position":
+                sums = _whole_sums(stage, g, _shifted(stage, g, h.joint, parts[0][1]))
             else:
                 sums = _whole_sums(stage, g, sum(_gain(pred, c, h.joint)[None, :, :, None] * X[:, :, None] for c, X in parts))
         total = sums if total is None else total + sums
@@ -230,6 +234,23 @@ def _score(
     c = weights / size
     step = stage.damped @ (stage.moment - total.columns @ c)
     return Score(h, float(y @ weights), len(c), _start(start, c, h, shape, stage.problem), c, shape, step)
+
+
+def _shifted(stage: _Stage, g: int, joint: int, signals: np.ndarray) -> np.ndarray:
+    """Outputs (S, L, n + M, m) of a motion by signals (S, L, m) of the position of a joint, which move gravity and inertia along."""
+    group, pred, problem = stage.problem.groups[g], stage.predictions[g], stage.problem
+
+    def outputs(Q: np.ndarray) -> np.ndarray:
+        of = replace(group, Q=Q)
+        return predict(stage.fit.model, of, problem.sampling, W=pred.solution.W, steps=1, torques=pred.solution.torques).outputs(of)
+
+    before, out = outputs(group.Q), []
+    for X in np.moveaxis(signals, -1, 0):
+        Y = np.zeros_like(group.Q)
+        Y[..., joint] = X
+        step = SHIFT / max(np.abs(group.to_time(Y)).max(), 1e-300)
+        out.append((outputs(group.Q + step * Y) - before) / step)
+    return np.stack(out, axis=-1)
 
 
 def _lines(motion: Motion, signals: Sequence[np.ndarray]) -> np.ndarray:

@@ -467,7 +467,7 @@ def test_a_step_that_is_cut_to_lead_uphill_does_not_end_a_fit(ur10, named):
     before, after = (predictions(problem, m, [None] * len(problem.groups), steps=None) for m in (result.model, true))
     problem = recorded_with(problem, before, after)
     start = replace(true, effects=(slip, Effect(hinge, np.array([1.5e5, 3.0, 0.5]))))
-    found = refit(problem, start, result.weights, result.remainders, 10)
+    found = refit(problem, start, result.weights, result.remainders, 20)
     assert found.model.effects[1].value("stiffness") == pytest.approx(5e4, rel=0.02)
 
 
