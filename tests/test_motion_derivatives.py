@@ -1,0 +1,109 @@
+"""Along a motion what moves the links moves gravity and inertia: derivatives, responses and fits hold that."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.coordinates import pack, unpack
+from ident.dataset import Dataset, Segment
+from ident.derivatives import jacobian
+from ident.hypotheses import catalogue
+from ident.identification import guessed_noise, set_up
+from ident.inverse import REMAINDER_STEPS
+from ident.model import Effect, Model
+from ident.problem import predictions
+from ident.records import build_groups
+from ident.screening import screen
+from ident.torque_fit import fit
+
+RATE, SECONDS = 200.0, 20.0
+
+
+def motion(robot, seed, tau_noise=0.02, hold="none"):
+    """A recorded motion through many postures; its torque is noise alone."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(SECONDS * RATE)) / RATE
+    w = 2 * np.pi * 0.1 * np.arange(1, 6)
+    a, b = rng.normal(size=(2, 5, robot.n)) * 0.25
+    arg = np.multiply.outer(t, w)
+    q = np.sin(arg) @ a + np.cos(arg) @ b + rng.uniform(-0.5, 0.5, robot.n)
+    tau = tau_noise * rng.normal(size=q.shape)
+    segment = Segment(name=f"m{seed}", role="identification", kind="trajectory", t=t, tau=tau, q=q)
+    return Dataset(
+        name="motion", robot_ref=robot.name, robot=robot, sample_rate=RATE, joints=robot.joint_names, input_hold=hold,
+        q_std=np.full(robot.n, 1e-6), tau_std=np.full(robot.n, 0.02), controller=None, segments=(segment,),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def moving(ur10):
+    problem = set_up(motion(ur10, 1)).problem
+    model = Model(problem.structure, problem.nominal)
+    return problem, model, predictions(problem, model, [None], steps=None)
+
+
+def anew(problem, model, near):
+    """Outputs with the geometric remainder made anew."""
+    (pred,) = predictions(problem, model, [near.solution.W], steps=REMAINDER_STEPS)
+    return pred.outputs(problem.groups[0])
+
+
+def test_softer_gears_move_gravity_and_inertia(moving):
+    problem, model, (pred,) = moving
+    group, n = problem.groups[0], problem.structure.n
+    J, x = jacobian(problem, model, group, pred).dense(), pack(model)
+    for j in range(n):
+        step = 1e-3 * (np.arange(len(x)) == j)
+        ends = [anew(problem, unpack(model, x + sign * step, np.inf), pred) for sign in (1.0, -1.0)]
+        slope = group.observe((ends[0] - ends[1]) / 2e-3)
+        assert np.linalg.norm(group.observe(J[..., j]) - slope) < 0.03 * np.linalg.norm(slope)
+
+
+@pytest.fixture(scope="module")
+def eccentric(moving):
+    """The problem as recorded by an encoder that errs by 10 mrad once a turn, and that effect."""
+    problem, model, _ = moving
+    hidden = next(h for h in catalogue(problem.structure) if h.key == ("encoder_eccentricity", "wrist_1_joint"))
+    true = replace(model, effects=(Effect(hidden, np.array([8e-3, -6e-3])),))
+    (pred,) = predictions(problem, true, [None], steps=None)
+    group = problem.groups[0]
+    return replace(problem, groups=(replace(group, U=group.U + pred.U, U_periods=group.U_periods + pred.U[:, None]),)), true
+
+
+def test_a_fit_of_a_position_error_ends_where_it_is(eccentric):
+    problem, true = eccentric
+    effect = true.effects[0]
+    found = fit(problem, replace(true, effects=(replace(effect, p=0.5 * effect.p),)), iterations=8)
+    assert found.model.effects[0].p == pytest.approx(effect.p, abs=1e-4)
+    assert found.chi2_per_dof < 1.2
+    again = fit(problem, found.model, remainders=found.remainders, iterations=20)
+    assert again.cost < found.cost + 1.0
+
+
+def test_a_position_error_is_screened_with_what_it_moves(eccentric):
+    """At its own joint first, and with a start that is nearly right: gravity and inertia beside a constant posture would not do."""
+    problem, true = eccentric
+    baseline = fit(problem, replace(true, effects=()), iterations=1, hold=1e6)
+    preds = predictions(problem, baseline.model, baseline.remainders)
+    turning = [h for h in catalogue(problem.structure) if h.effect == "encoder_eccentricity"]
+    best = screen(problem, baseline, preds, turning)[0]
+    assert best.hypothesis.place == "wrist_1_joint"
+    assert best.start == pytest.approx(true.effects[0].p, rel=0.1)
+
+
+@pytest.mark.parametrize(("hold", "folded"), [("none", 0.2), ("zoh", 0.2), ("none", 0.02)])
+def test_torque_of_a_faster_loop_that_folds_into_a_log_is_noise(ur10, hold, folded):
+    """Ten times the noise that is given circulates between the samples: of a torque that is held it is a torque as any other."""
+    data = motion(ur10, 2, folded, hold)
+    loud = hold == "none" and folded > 0.1
+    assert set_up(data).problem.tau_std == pytest.approx(np.full(ur10.n, folded if loud else 0.02), rel=0.1)
+    assert guessed_noise(data) == [False, loud]
+
+
+@pytest.mark.parametrize("band_hz", [1.6, 8.0])
+def test_the_ends_of_a_motion_are_tapered_by_the_width_of_the_band(ur10, band_hz):
+    (group,) = build_groups(motion(ur10, 3), motion_band_hz=band_hz)
+    t = np.arange(group.n_time) * group.period_time / group.n_time
+    rising = t[np.argmax(group.window > 0.999)]
+    assert rising == pytest.approx(max(0.5, 2.0 / band_hz), abs=0.06)
