@@ -29,6 +29,17 @@ def small_plan(robot, seed, *, points=2, levels=(1.0, 0.4), period=2000, validat
     )
 
 
+def through_postures(rng, n, rate, seconds):
+    """Times, and positions, velocities and accelerations of a motion through many postures, of five lines from 0.1 Hz on."""
+    t = np.arange(int(seconds * rate)) / rate
+    w = 2 * np.pi * 0.1 * np.arange(1, 6)
+    a, b = rng.normal(size=(2, 5, n)) * 0.25
+    arg = np.multiply.outer(t, w)
+    q = np.sin(arg) @ a + np.cos(arg) @ b + rng.uniform(-0.5, 0.5, n)
+    v = (np.cos(arg) * w) @ a - (np.sin(arg) * w) @ b
+    return t, q, v, -(np.sin(arg) * w**2) @ a - (np.cos(arg) * w**2) @ b
+
+
 def through_files(data, folder):
     """What a user's diagnosis sees: the files alone."""
     save_dataset(data, folder / "dataset")

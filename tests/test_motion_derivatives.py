@@ -16,6 +16,7 @@ from ident.problem import predictions
 from ident.records import build_groups
 from ident.screening import screen
 from ident.torque_fit import fit
+from tests.conftest import through_postures
 
 RATE, SECONDS = 200.0, 20.0
 
@@ -23,11 +24,7 @@ RATE, SECONDS = 200.0, 20.0
 def motion(robot, seed, tau_noise=0.02, hold="none"):
     """A recorded motion through many postures; its torque is noise alone."""
     rng = np.random.default_rng(seed)
-    t = np.arange(int(SECONDS * RATE)) / RATE
-    w = 2 * np.pi * 0.1 * np.arange(1, 6)
-    a, b = rng.normal(size=(2, 5, robot.n)) * 0.25
-    arg = np.multiply.outer(t, w)
-    q = np.sin(arg) @ a + np.cos(arg) @ b + rng.uniform(-0.5, 0.5, robot.n)
+    t, q, _, _ = through_postures(rng, robot.n, RATE, SECONDS)
     tau = tau_noise * rng.normal(size=q.shape)
     segment = Segment(name=f"m{seed}", role="identification", kind="trajectory", t=t, tau=tau, q=q)
     return Dataset(

@@ -27,7 +27,7 @@ from ident.trust import too_fast
 from robot_assets.robot import Elasticity, load_robot
 from sim import parse_effect, run_experiment
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files
+from tests.conftest import small_plan, through_files, through_postures
 
 RATE = 250.0
 CHANGED = {
@@ -40,13 +40,7 @@ COULOMB, OFFSET = np.array([8.0, 9.0, 5.0, 1.0, 0.8, 0.5]), np.array([0.5, -2.0,
 def rigid_motion(robot, seed, seconds=20.0):
     """A recorded motion of a rigid arm whose links are not as described; torques by Pinocchio."""
     rng = np.random.default_rng(seed)
-    t = np.arange(int(seconds * RATE)) / RATE
-    w = 2 * np.pi * 0.1 * np.arange(1, 6)
-    a, b = rng.normal(size=(2, 5, robot.n)) * 0.25
-    arg = np.multiply.outer(t, w)
-    q = np.sin(arg) @ a + np.cos(arg) @ b + rng.uniform(-0.5, 0.5, robot.n)
-    v = (np.cos(arg) * w) @ a - (np.sin(arg) * w) @ b
-    acc = -(np.sin(arg) * w**2) @ a - (np.cos(arg) * w**2) @ b
+    t, q, v, acc = through_postures(rng, robot.n, RATE, seconds)
     structure, par = build_structure(robot, links=CHANGED), Parameters.nominal(robot)
     data = structure.model.createData()
     tau = np.array([pin.rnea(structure.model, data, *x) for x in zip(q, v, acc, strict=True)])
