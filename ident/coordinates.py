@@ -71,6 +71,12 @@ def shifts_posture(model: Model) -> bool:
     return any(e.hypothesis.channel in SHIFTS and not is_along_record(e.hypothesis) for e in model.effects)
 
 
+def moves_geometry(effect: Effect, motion: bool) -> bool:
+    """Whether an effect changes the geometric remainder to first order: a change of the arm, and along a motion an error of the position,
+    which shifts gravity and inertia with it."""
+    return effect.hypothesis.channel == "model" or (motion and effect.hypothesis.channel == "position")
+
+
 def moves_links(model: Model) -> np.ndarray:
     """Which fitted coordinates change the motion of the links along given motor motion."""
     n, n_e = model.structure.n, len(model.structure.elastic)

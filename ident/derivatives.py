@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from ident.columns import Columns, Products
-from ident.coordinates import coordinate_names, effect_steps, moves_links, pack, shifts_posture, unpack
+from ident.coordinates import coordinate_names, effect_steps, moves_geometry, moves_links, pack, shifts_posture, unpack
 from ident.errors_in_variables import impedance_slopes, scatter_information, scatter_slope
 from ident.extended import Prediction, predict, predict_at, through_drives
 from ident.group import Group
@@ -38,8 +38,13 @@ def jacobian(
     """
     m = len(model.par.to_log())
     top = compared_lines(group)
-    now = _again(problem, model, group, pred, 1) if exact else pred
-    posture = moved_by_posture(pred)[:, :top] if shifts and not exact and group.window is None else None
+    motion = group.window is not None
+    # Along a motion softer gears move gravity and inertia too; link encoders show the links themselves.
+    sway = range(model.structure.n) if motion and not group.links else ()
+    remade = pred
+    if exact or sway or any(moves_geometry(e, motion) for e in model.effects):
+        remade = _again(problem, model, group, pred, 1)
+    posture = moved_by_posture(pred)[:, :top] if shifts and not exact and not motion else None
     n, base = model.structure.n, _baseline(model, pred, top)
     late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
     late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
@@ -47,13 +52,13 @@ def jacobian(
     if posture is not None:
         baseline = baseline.replaced(_sagging(baseline, pred, posture))
     baseline = baseline.replaced(_passed_on(baseline, model, group, pred))
-    baseline = baseline.replaced(_differences(problem, model, group, pred, now, exact, posture))
+    baseline = baseline.replaced(_differences(problem, model, group, pred, remade, sway, exact, posture))
     if not problem.free_timing:
         baseline.whole[..., baseline.whole_at == m] = 0.0
     effects = [
         column
         for i in range(len(model.effects))
-        for column in _effect_columns(problem, model, group, pred, now, i, exact, posture)
+        for column in _effect_columns(problem, model, group, pred, remade, i, exact, posture)
     ]
     columns = baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
     still = held(pred, group)
@@ -105,7 +110,8 @@ def _differences(
     model: Model,
     group: Group,
     pred: Prediction,
-    now: Prediction,
+    remade: Prediction,
+    sway: Iterable[int],
     exact: bool,
     posture: np.ndarray | None,
 ) -> dict[int, np.ndarray]:
@@ -113,25 +119,26 @@ def _differences(
 
     These laws move with the gear's spring and damper; and where the recorded torque says its deflection, with what
     the motor takes of that, and with the timing.
+
+    Args:
+        remade: ``pred`` with its geometric remainder one step on, where anything is told by its change.
+        sway: coordinates that move the links along a motion.
     """
     n, m = model.structure.n, len(model.par.to_log())
     along = joints_along_record(model, group)
     gears = {e.hypothesis.joint for e in model.effects if e.hypothesis.gear_law}
     steps = {f * n + j: BASELINE_STEP for j in gears for f in range(4 if j in along else 2)}
-    # Along a motion softer gears move gravity and inertia too; link encoders show the links themselves.
-    along_motion = range(n) if group.window is not None and not group.links else ()
-    anew = dict.fromkeys(np.flatnonzero(moves_links(model)[:m]).tolist() if exact else along_motion, BASELINE_STEP)
-    steps |= anew
+    anew = set(np.flatnonzero(moves_links(model)[:m]).tolist() if exact else sway)
+    steps |= dict.fromkeys(anew, BASELINE_STEP)
     if along:
         steps[m] = TIMING_STEP
     x = pack(model)
 
     def column(c: int, step: float) -> np.ndarray:
         there = unpack(model, x + step * (np.arange(len(x)) == c), np.inf)
-        base = now if exact or c not in anew else settled
-        return _change(group, _again(problem, there, group, pred, int(c in anew)), base, posture) / step
+        again = exact or c in anew
+        return _change(group, _again(problem, there, group, pred, int(again)), remade if again else pred, posture) / step
 
-    settled = _again(problem, model, group, pred, 1) if anew and not exact else now
     return {c: column(c, step) for c, step in steps.items()}
 
 
@@ -166,12 +173,16 @@ def _effect_columns(
     model: Model,
     group: Group,
     pred: Prediction,
-    now: Prediction,
+    remade: Prediction,
     i: int,
     exact: bool,
     posture: np.ndarray | None,
 ) -> list[np.ndarray]:
-    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences from ``now``."""
+    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences.
+
+    Args:
+        remade: as of ``_differences``.
+    """
     effect = model.effects[i]
     h, steps, top = effect.hypothesis, effect_steps(effect), compared_lines(group)
     if h.channel == "motor" and not joints_along_record(model, group):
@@ -182,9 +193,8 @@ def _effect_columns(
         Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
         for p, _ in steps
     ]
-    # Along a motion what shifts the position shifts gravity and inertia with it.
-    if exact or h.channel == "model" or (h.channel == "position" and group.window is not None):
-        base, posture = now if exact else _again(problem, model, group, pred, 1), None
+    if exact or moves_geometry(effect, group.window is not None):
+        base, posture = remade, None
         moved = [_again(problem, m, group, pred, 1) for m in models]
     else:
         base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}

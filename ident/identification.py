@@ -140,23 +140,28 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     A torque that is not held from sample to sample may be made by a faster loop, of which the record holds single samples: what circulates
     there folds into all lines, and is noise beside that which is given.
     """
-    out = []
-    for given, channel in ((dataset.q_std, "q"), (dataset.tau_std, "tau")):
-        known = given is not None and np.all(given > 0)
-        if known and (channel == "q" or dataset.input_hold == "zoh"):
-            out.append(np.asarray(given, float))
-        else:
-            signals = [getattr(s, channel) for s in dataset.segments]
-            each = np.median([difference_noise(x) for x in signals], axis=0)
-            out.append(np.maximum(each, least_noise(dataset, channel)))
-    return out[0], out[1]
+    return _noise_of(dataset, "q"), _noise_of(dataset, "tau")
+
+
+def _noise_of(dataset: Dataset, channel: str) -> np.ndarray:
+    given = given_noise(dataset, channel)
+    if given is not None and (channel == "q" or dataset.input_hold == "zoh"):
+        return given
+    each = np.median([difference_noise(getattr(s, channel)) for s in dataset.segments], axis=0)
+    return np.maximum(each, least_noise(dataset, channel))
+
+
+def given_noise(dataset: Dataset, channel: str) -> np.ndarray | None:
+    """(n,) noise of the samples of a channel that the dataset gives, rad or N m; None where it does not."""
+    given = dataset.q_std if channel == "q" else dataset.tau_std
+    return np.asarray(given, float) if given is not None and np.all(given > 0) else None
 
 
 def least_noise(dataset: Dataset, channel: str) -> np.ndarray:
     """(n,) noise of the samples of a channel that is taken at least, rad or N m: as given, else a small share of its signal."""
-    given = dataset.q_std if channel == "q" else dataset.tau_std
-    if given is not None and np.all(given > 0):
-        return np.asarray(given, float)
+    given = given_noise(dataset, channel)
+    if given is not None:
+        return given
     size = np.median([np.std(getattr(s, channel), axis=0) for s in dataset.segments], axis=0)
     return np.maximum(LEAST_NOISE[channel] * size, 1e-9 if channel == "q" else 1e-6)
 
@@ -249,8 +254,8 @@ def under_noise_beside_causes(
 
 def guessed_noise(dataset: Dataset) -> list[bool]:
     """Whether the noise of position and of torque are not given, or as ``_noise`` says not all that there is."""
-    q_known, tau_known = (given is not None and np.all(given > 0) for given in (dataset.q_std, dataset.tau_std))
-    return [not q_known, not tau_known or np.any(_noise(dataset)[1] > np.sqrt(LOUD) * dataset.tau_std)]
+    q_std, tau_std = (given_noise(dataset, channel) for channel in ("q", "tau"))
+    return [q_std is None, tau_std is None or bool(np.any(_noise_of(dataset, "tau") > np.sqrt(LOUD) * tau_std))]
 
 
 def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> Problem:

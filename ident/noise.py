@@ -30,12 +30,12 @@ BAND_LINES = 20  # of a band in which a quantile, or the coherence of neighbouri
 TOGETHER, NO_CHANCE = 0.8, 5.0  # coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
 
 
-def white_covariance(Z: np.ndarray, tau_var: np.ndarray, q_var: np.ndarray) -> np.ndarray:
+def white_covariance(Z: np.ndarray, tau_var: np.ndarray | float, q_var: np.ndarray) -> np.ndarray:
     """``diag(tau_var) + Z diag(q_var) Z^H``; (L, n, n).
 
     Args:
         Z: (L, n, n) recorded torque per motor position.
-        tau_var, q_var: (n,) variance of a spectral line of each channel.
+        tau_var, q_var: (n,) variance of a spectral line of each channel; the latter (L, 1, n) where it is not white.
     """
     out = (Z * q_var) @ np.conj(np.swapaxes(Z, 1, 2))
     k = np.arange(Z.shape[1])
@@ -68,7 +68,7 @@ def residual_covariance(
         return S[: group.n_compared]
     d, lines, dof_line = found
     Zk = Z[: group.n_compared]
-    tau_var, q_var = group.known_noise or _white_levels(np.sum(np.abs(d) ** 2, axis=0), Zk[lines], dof_line)
+    tau_var, q_var = group.known_noise or _white_levels(np.sum(np.abs(d[:, 1:]) ** 2, axis=0), Zk[lines[1:]], np.full(len(lines) - 1, dof_line))
     S = white_covariance(Zk, tau_var, q_var)
     root = np.linalg.cholesky(S)
     white = np.linalg.solve(root[lines][None], d[..., None])[..., 0]
@@ -121,18 +121,18 @@ def sample_noise(groups: Sequence[Group], impedances: Sequence[np.ndarray], samp
         dof.append(np.full(len(lines) - 1, dof_line))
     if not power:
         return None
-    levels = _white_levels(*(np.concatenate([x[:1], *parts]) for x, parts in ((p[0], p) for p in (power, gains, dof))))
-    return np.sqrt(levels[0]), np.sqrt(levels[1])
+    tau_var, q_var = _white_levels(*map(np.concatenate, (power, gains, dof)))
+    return np.sqrt(tau_var), np.sqrt(q_var)
 
 
-def _white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Channel variances, (n,) each, of the line power (K, n) of the residual; the first line is left out.
+def _white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Channel variances, (n,) each, of the line power (K, n) of the residual.
 
     Few lines may be likeliest without any noise of the torque: beside the likeliest noise of the positions its mean over all levels
     that are likely is taken.
 
     Args:
-        dof: degrees of freedom of each line, (K,) or of all.
+        dof: (K,) degrees of freedom of the lines.
 
     Raises:
         FloatingPointError: power or gain without bounds.
@@ -140,8 +140,7 @@ def _white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray | float) -> 
     if not (np.all(np.isfinite(power)) and np.all(np.isfinite(Z))):
         raise FloatingPointError("noise without bounds")
     floor = 1e-12 * np.maximum(power.mean(axis=0), 1e-300)
-    power, gain = np.maximum(power, LEAST_VARIANCE)[1:], np.abs(Z[1:]) ** 2
-    weight = np.broadcast_to(np.reshape(dof, (-1, 1)), (len(Z), 1))[1:]
+    power, gain, weight = np.maximum(power, LEAST_VARIANCE), np.abs(Z) ** 2, dof[:, None]
     q_var = likeliest_levels(power, gain, weight)[1]
     return _mean_level(power, gain @ q_var, weight) + floor, q_var + 1e-12 * floor
 

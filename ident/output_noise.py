@@ -7,7 +7,7 @@ import numpy as np
 from ident.extended import Prediction
 from ident.group import Group
 from ident.law_noise import law_noise, loop_noise, record_noise
-from ident.noise import residual_covariance
+from ident.noise import residual_covariance, white_covariance
 from ident.problem import Problem
 
 LEAST_NOISE = 0.5  # of the noise of a linear arm, that is left in any direction of the residual
@@ -35,8 +35,7 @@ def noise_covariance(
     else:
         S = _with_record(S, of_record[: group.n_compared])
     if group.rounding is not None:
-        half = prediction.sampled_impedance[: group.n_compared] * np.sqrt(group.rounding)[:, None]
-        S += half @ np.conj(np.swapaxes(half, 1, 2))
+        S += white_covariance(prediction.sampled_impedance[: group.n_compared], 0.0, group.rounding[:, None])
     return S
 
 
@@ -55,16 +54,14 @@ def output_covariance(
     n, links, samples = S.shape[-1], list(group.links), problem.samples(group)
     if not links:
         return S
-    position = np.broadcast_to(problem.q_std**2 / samples, (len(S), n))
+    position = problem.q_std**2 / samples
     if group.rounding is not None:
-        position = position + group.rounding
+        position = position + group.rounding[:, None]
     recorded, true = prediction.filters
     per_position = prediction.plane.output_per_position[: len(S)] * true[: len(S), None]
     per_position[:, :n] *= recorded[: len(S), :, None]
-    half = per_position * np.sqrt(position)[:, None]
-    all_of_it = half @ np.conj(np.swapaxes(half, 1, 2))
-    k = np.arange(n, n + len(links))
-    all_of_it[:, k, k] += group.link_std[links] ** 2 / samples
+    of_links = np.concatenate([np.zeros(n), group.link_std[links] ** 2 / samples])
+    all_of_it = white_covariance(per_position, of_links, position)
     all_of_it[:, :n, :n] = S
     return all_of_it
 

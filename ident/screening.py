@@ -218,10 +218,8 @@ def _score(
                 parts.append(("motor", _lines(motion, made.motor)))
             if group.window is None:
                 sums = _line_sums([(fields[g][c], X[:, : group.n_compared]) for c, X in parts])
-            elif h.channel == "position":
-                sums = _whole_sums(stage, g, _shifted(stage, g, h.joint, parts[0][1]))
             else:
-                sums = _whole_sums(stage, g, sum(_gain(pred, c, h.joint)[None, :, :, None] * X[:, :, None] for c, X in parts))
+                sums = _whole_sums(stage, g, sum(_along_motion(stage, g, c, h.joint, X) for c, X in parts))
         total = sums if total is None else total + sums
     if total is None:
         return None
@@ -236,9 +234,11 @@ def _score(
     return Score(h, float(y @ weights), len(c), _start(start, c, h, shape, stage.problem), c, shape, step)
 
 
-def _shifted(stage: _Stage, g: int, joint: int, signals: np.ndarray) -> np.ndarray:
-    """Outputs (S, L, n + M, m) of a motion by signals (S, L, m) of the position of a joint, which move gravity and inertia along."""
+def _along_motion(stage: _Stage, g: int, channel: str, joint: int, signals: np.ndarray) -> np.ndarray:
+    """Outputs (S, L, n + M, m) of a motion by signals (S, L, m) of a channel at a joint; those of the position move gravity and inertia."""
     group, pred, problem = stage.problem.groups[g], stage.predictions[g], stage.problem
+    if channel != "position":
+        return _gain(pred, channel, joint)[None, :, :, None] * signals[:, :, None]
 
     def outputs(Q: np.ndarray) -> np.ndarray:
         of = replace(group, Q=Q)

@@ -19,6 +19,7 @@ from ident.coordinates import (
     TIMING_LIMIT,
     clip_effects,
     coordinate_names,
+    moves_geometry,
     moves_links,
     pack,
     prior_of,
@@ -194,8 +195,8 @@ def fit(
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
     # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a new one.
-    changing = ("model", "position") if problem.motions_alone else ("model",)
-    anew = (shifts_posture(model) and not problem.motions_alone) or any(e.hypothesis.channel in changing for e in model.effects)
+    motion = problem.motions_alone
+    anew = (shifts_posture(model) and not motion) or any(moves_geometry(e, motion) for e in model.effects)
     moves, drift = moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False
