@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ident.identification import identify, set_up
-from ident.noise import LEVEL_STEPS, _white_levels, likeliest_levels
+from ident.noise import LEVEL_STEPS, _white_levels, likeliest_levels, residual_covariance
+from ident.problem import predictions
 from ident.transients import ends_of_transients
 
 PERIOD, TOP, STD = 4000, 300, 2e-3
@@ -144,3 +145,16 @@ def test_picked_records_keep_their_noise(single):
     group = set_up(single).problem.groups[0]
     rows = np.array([0, 2])
     assert np.array_equal(group.pick(rows).U_noise, group.U_noise[rows])
+
+
+def test_noise_that_all_records_tell_weighs_each_of_them(single):
+    """A group whose own lines happened to hold no noise would outweigh all others; it does not."""
+    setup, baseline = identify(single)
+    group = setup.problem.groups[0]
+    Z = predictions(setup.problem, baseline.model, baseline.remainders)[0].sampled_impedance
+    samples = setup.problem.samples(group)
+    noise = {"tau_std": setup.problem.tau_std, "q_std": setup.problem.q_std, "samples": samples}
+    silent = replace(group, U_noise=0.0 * group.U_noise, Q_noise=0.0 * group.Q_noise)
+    told, alone = (residual_covariance(g, Z, **noise)[0, 0, 0].real for g in (silent, replace(silent, known_noise=None)))
+    level = setup.problem.tau_std[0] ** 2 / samples
+    assert told > 0.2 * level > 20.0 * alone
