@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from ident.baseline import DETECTION_EXCESS
 from ident.evidence import Candidate, errors_by_joint, weigh
 from ident.hypotheses import Hypothesis, catalogue
 from ident.hypotheses.bodies import payload, payload_like
@@ -29,6 +30,7 @@ from ident.torque_fit import Fit
 
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 SAME_PERIOD = 0.01  # relative, of two ripples
+FAR_BEHIND = 3.0  # times what the best of a contest leaves: a rival that leaves that much more after a few steps is out
 REMATCH = 0.002  # probability from which a rival is weighed against a cause again at the end
 
 
@@ -75,14 +77,20 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
 
     def entered(effect: Effect) -> Fit | None:
         model = replace(current.model, effects=(*others, effect))
-        last = refit(problem, model, current.weights, current.remainders, POLISH_STEPS)
-        return last and either_turn(problem, last, last.model.effects[-1], POLISH_STEPS)
+        return refit(problem, model, current.weights, current.remainders)
+
+    def finished(entrant: Candidate) -> Candidate:
+        last = entrant.fit
+        if not last.converged:
+            last = refit(problem, last.model, last.weights, last.remainders, POLISH_STEPS) or last
+        return replace(entrant, fit=either_turn(problem, last, last.model.effects[-1]))
 
     entrants = [own, *rivals] if rivals else []
     fits = workers.map_in_time(entered, entrants, lambda e: f"again: {e.hypothesis.effect} at {e.hypothesis.place}")
     ran = [Candidate(e.hypothesis, r, 0.0) for e, r in zip(entrants, fits, strict=True) if r is not None]
     if len(ran) < 2 or ran[0].hypothesis is not own.hypothesis:
         return current, found
+    ran = workers.map(finished, in_reach(ran))
     first = ran[0].fit
     best_of: dict[tuple[str, str], Candidate] = {}
     for c in sorted(ran, key=lambda c: c.fit.cost):
@@ -101,6 +109,13 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
     known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
     return current, replace(found, candidates=tuple(known))
+
+
+def in_reach(ran: Sequence[Candidate]) -> list[Candidate]:
+    """The first of the entrants, and those that a few steps have not shown to be far behind the best."""
+    best = min((c.fit for c in ran), key=lambda r: r.cost)
+    left = max(FAR_BEHIND * (best.cost - best.count), (DETECTION_EXCESS - 1.0) * best.count)
+    return [c for i, c in enumerate(ran) if i == 0 or c.fit.cost - best.cost <= left]
 
 
 def same_as_special(candidate: Candidate, ran: Mapping[tuple[str, str], Candidate]) -> bool:

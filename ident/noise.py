@@ -19,7 +19,8 @@ PRIOR_DOF = 30.0  # weight of the white-noise model against the scatter around i
 SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
 WINDOWED = 2.0  # neighbouring lines of a spectrum through a window, that count as one
 LEVEL_STEPS = 60  # towards the likeliest levels
-LEVELS, LEAST_LEVEL, MOST_LEVEL = 400, 1e-5, 1e5  # of the noise of the torque, over the quietest line, between which it is sought
+LEAST_LEVEL, MOST_LEVEL = 1e-5, 1e5  # of the noise of the torque, over the quietest line, between which it is sought
+LEVELS = 60  # of it over that range, and as many about the likeliest
 LEAST_VARIANCE = 1e-140  # of a line, of records without any noise
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
@@ -168,13 +169,24 @@ def likeliest_levels(power: np.ndarray, gain: np.ndarray, weight: np.ndarray) ->
 
 
 def _mean_level(power: np.ndarray, others: np.ndarray, dof: np.ndarray) -> np.ndarray:
-    """Mean (n,) over all levels of the torque noise, each as likely as it makes the power (K, n) of lines that hold other noise too."""
-    least = np.maximum(np.min(power, axis=0), LEAST_VARIANCE)
-    level = least * np.geomspace(LEAST_LEVEL, MOST_LEVEL, LEVELS)[:, None]
-    mean = level[:, None] + others
-    likely = -np.sum(dof * (np.log(mean) + power / mean), axis=1) + np.log(level)
+    """Mean (n,) over all levels of the torque noise, each as likely as it makes the power (K, n) of lines that hold other noise too.
+
+    Integrals over the logarithm of the level by the trapezoidal rule: over all of its range, and finely where many lines make it sharp.
+    """
+    least = np.log(np.maximum(np.min(power, axis=0), LEAST_VARIANCE))
+
+    def likelihood(x: np.ndarray) -> np.ndarray:
+        mean = np.exp(x)[:, None] + others
+        return -np.sum(dof * (np.log(mean) + power / mean), axis=1) + x
+
+    wide = least + np.linspace(np.log(LEAST_LEVEL), np.log(MOST_LEVEL), LEVELS)[:, None]
+    likely = likelihood(wide)
+    fine = np.take_along_axis(wide, np.argmax(likely, axis=0)[None], axis=0) + (wide[1] - wide[0]) * np.linspace(-1.0, 1.0, LEVELS)[:, None]
+    x = np.concatenate([wide, fine])
+    order = np.argsort(x, axis=0)
+    x, likely = (np.take_along_axis(a, order, axis=0) for a in (x, np.concatenate([likely, likelihood(fine)])))
     share = np.exp(likely - likely.max(axis=0))
-    return np.sum(share * level, axis=0) / np.sum(share, axis=0)
+    return np.trapezoid(share * np.exp(x), x, axis=0) / np.trapezoid(share, x, axis=0)
 
 
 def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
