@@ -74,7 +74,7 @@ def shifts_posture(model: Model) -> bool:
 def moves_geometry(effect: Effect, motion: bool) -> bool:
     """Whether an effect changes the geometric remainder to first order: a change of the arm, and along a motion an error of the position,
     which shifts gravity and inertia with it."""
-    return effect.hypothesis.channel == "model" or (motion and effect.hypothesis.channel == "position")
+    return effect.hypothesis.channel == "model" or (motion and effect.hypothesis.channel in ("position", "spring"))
 
 
 def moves_links(model: Model) -> np.ndarray:

@@ -185,6 +185,8 @@ def _effect_columns(
     """
     effect = model.effects[i]
     h, steps, top = effect.hypothesis, effect_steps(effect), compared_lines(group)
+    if group.window is None:
+        steps = [s for s, q in zip(steps, h.parameters, strict=True) if not q.at_start]
     if h.channel == "motor" and not joints_along_record(model, group):
         return [column[:, :top] for column in _motor_columns(model, group, pred, effect, steps)]
     if h.channel == "drive":
@@ -199,7 +201,9 @@ def _effect_columns(
     else:
         base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}
         moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
-    return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]
+    columns = iter([_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)])
+    none = np.zeros((len(pred.U), top, model.structure.n + len(group.links)), complex)
+    return [none if q.at_start and group.window is None else next(columns) for q in h.parameters]
 
 
 def _motor_columns(

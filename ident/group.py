@@ -203,6 +203,11 @@ class Group:
         return replace(self, omega=self.omega[: self.n_slow], excited=self.excited[:, : self.n_slow], n_slow=None, Q_fast=None, **cut)
 
     @property
+    def recorded_share(self) -> float:
+        """Share of a period that was recorded; of a motion the rest is the return that closes it."""
+        return 1.0 if self.window is None else float(np.flatnonzero(self.window)[-1] + 1) / len(self.window)
+
+    @property
     def window_share(self) -> float:
         """Share of the power of a record that its window leaves; 1 where there is none."""
         return 1.0 if self.window is None else float(np.mean(self.window**2))

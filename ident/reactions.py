@@ -147,7 +147,7 @@ def _along_record(
     known[:, 1:] = solution.delta[:, 1:, j] - link * more
 
     def torque_at(x: np.ndarray, bisections: int) -> np.ndarray:
-        along = kernels.along_deflection(*law, group.to_time(x[..., None])[..., 0], mean, bisections)
+        along = kernels.along_deflection(*law.shape, group.to_time(x[..., None])[..., 0], mean, bisections)
         return group.to_lines(along[..., None])[..., 0]
 
     # What the damper adds at high frequency belongs to it: steps over the spring alone would run away there.
@@ -220,7 +220,7 @@ def _loop(
     x = grid.to_time(shown[..., None])[..., 0]
     rate = grid.to_time((1j * grid.omega * shown)[..., None])[..., 0] if kernels.sees_rate(law) else x
     start = modal_state(guess, grid.omega, grid.period_time / grid.n_time, modes)
-    torque = grid.to_lines(steady_loop(law, x, rate, modes, start)[..., None])[..., 0]
+    torque = grid.to_lines(steady_loop(law, x, rate, modes, start, returns=grid.recorded_share)[..., None])[..., 0]
     slope = kernels.mean_slope(law, grid.to_time((shown - compliance * torque)[..., None])[..., 0])[:, None]
     # The mean is shown as it is, and a gear within its dead band has no stiffness there to answer with.
     torque[:, 1:] += slope / (1.0 + slope * compliance[1:]) * (free - shown)[:, 1:]

@@ -60,12 +60,12 @@ def test_the_mean_torque_is_met_and_the_law_is_the_law(code, seed, mean, size):
     law = kernels.Law(code, a, b, k)
     x = np.fft.irfft(np.r_[0.0, rng.normal(size=5) + 1j * rng.normal(size=5)], 400)[None]
     x *= size / np.abs(x).max()
-    h = kernels.along_deflection(*law, x, np.array([mean]), 60)
+    h = kernels.along_deflection(*law.shape, x, np.array([mean]), 60)
     # The offset is the one at which the law gives this torque: here found again from the law at a point.
     low, high = -1.0, 1.0
     for _ in range(80):
         offset = 0.5 * (low + high)
-        there = kernels.along_deflection(*law, x + offset, np.array([0.0]), 0)
+        there = kernels.along_deflection(*law.shape, x + offset, np.array([0.0]), 0)
         low, high = (low, offset) if np.mean(k * (x + offset) + there) > mean else (offset, high)
     assert h == pytest.approx(there, abs=1e-6 * k * size + 1e-6)
     if code == kernels.BACKLASH:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ident.hypotheses import kernels
 from ident.hypotheses.loop import modal_state, steady_loop
-from ident.hypotheses.yielding import along_path, elastoplastic
+from ident.hypotheses.yielding import along_path, elastoplastic, onward
 
 PERIOD, POINTS = 2.0, 12000  # s, of the grid
 M, D, K = np.array([[1.0, 0.2], [0.2, 0.5]]), np.diag([1.5, 0.8]), np.array([[4e3, -5e2], [-5e2, 2e3]])
@@ -51,7 +51,7 @@ def loop(law, X, guess=None):
 
 
 def law_along(law, x, v):
-    code, a, b, k, exponent, recoil = law
+    code, a, b, k, exponent, recoil = law.shape
     if code == kernels.LINK:
         return a * x + b * np.tanh(v / k)
     if code == kernels.CABLE:
@@ -115,6 +115,23 @@ def test_an_element_that_hardly_yields_is_followed_to_where_it_creeps(monkeypatc
     found = loop(law, X)
     monkeypatch.setattr("ident.hypotheses.loop.SWEEPS", 500)
     assert found == pytest.approx(loop(law, X), abs=1e-6 * np.abs(found).max())
+
+
+@pytest.mark.parametrize("name", ["hysteresis", "rounded hysteresis", "cable that yields"])
+@pytest.mark.parametrize("start", [0.0, 0.9, -0.6])
+def test_what_yields_begins_a_motion_where_it_is_told_to(name, start):
+    """Over what was recorded it follows its law from there; the return leads it back, which swings the arm no more than the law does."""
+    law = LAWS[name]._replace(start=start)
+    X, recorded = free_motion(lines=6), 0.8
+    h = steady_loop(law, in_time(X), in_time(1j * OMEGA * X), MODES, returns=recorded)
+    x = in_time(X - compliance() * spectrum(h))
+    _, a, b, k, exponent, recoil = law.shape
+    spring, stiffness = (a, k) if law.code == kernels.CABLE else (0.0, a)
+    expected = spring * x + onward(np.diff(x, axis=1, prepend=x[:, -1:]), stiffness, b, exponent, recoil, np.full(len(x), start * b))
+    last = int(recorded * POINTS)
+    assert np.std((h - expected)[:, :last]) < 5e-3 * np.std(expected)
+    assert (h - spring * x)[:, -1] == pytest.approx(start * b, abs=1e-3 * b)
+    assert np.abs(np.diff(h, axis=1)).max() < 0.02 * np.ptp(h)
 
 
 def test_records_do_not_see_each_other():

@@ -27,6 +27,7 @@ class Parameter:
         center, spread: a weak prior, external units, the spread in fitted coordinates; none where infinite.
         per_stiffness: ``center`` is in units of the stiffness of the joint's gear.
         null: value at which the parameter is as good as absent, None where there is no such value.
+        at_start: whether it says how a motion begins, so that what repeats does not feel it.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Parameter:
     per_stiffness: bool = False
     null: float | None = None
     reported: bool = False
+    at_start: bool = False
 
     def prior_center(self, stiffness: float) -> float:
         """Centre of the weak prior in fitted coordinates, 0 where there is none."""
@@ -77,6 +79,7 @@ class Parameter:
         return max(abs(value), 1e-300)
 
 
+START = Parameter("start", "1", -1.0, 1.0, nuisance=True, step=0.02, center=0.0, spread=0.5, null=0.0, at_start=True)
 EXPONENT = Parameter("exponent", "1", 0.5, SLIP, True, nuisance=True, step=0.05, center=1.0, spread=1.5, reported=True)
 
 

@@ -26,6 +26,8 @@ class Law(NamedTuple):
             ``HYSTERESIS`` yields at ``b`` after a stiffness ``a``; ``LINK`` is ``a x + b tanh(x' / k)`` on a link; ``CABLE`` is ``a x`` and a spring ``k`` that yields at ``b`` there.
         k: linear stiffness of the gear, N m/rad.
         exponent, recoil: of an element that yields (see ``yielding``); a Maxwell slip where nothing is said.
+        start: torque of such an element where a motion begins, over that at which it yields: it was left by motions that were not
+            recorded. What repeats has none.
     """
 
     code: int
@@ -34,6 +36,12 @@ class Law(NamedTuple):
     k: float
     exponent: float = SLIP
     recoil: float = 0.0
+    start: float = 0.0
+
+    @property
+    def shape(self) -> tuple[int, float, float, float, float, float]:
+        """What the compiled code asks for: all but the ``start``."""
+        return self[:6]
 
 
 @njit(cache=True, nogil=True)
@@ -154,7 +162,7 @@ def along_motion(law: Law, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
         return law.a * x + law.b * np.tanh(rate / law.k)
     if law.code == CABLE:
         return law.a * x + along_path(np.diff(x, axis=1, prepend=x[:, -1:]), law.k, law.b, SLIP, 0.0)
-    torque = along_deflection(*law, x, np.zeros(len(x)), 0)
+    torque = along_deflection(*law.shape, x, np.zeros(len(x)), 0)
     return torque - law.b * rate * (np.abs(x) < 0.5 * law.a) if law.code == BACKLASH else torque
 
 
@@ -261,6 +269,8 @@ def loop_sweep(
     start: np.ndarray,
     memory: np.ndarray,
     out: np.ndarray,
+    returns: int,
+    begin: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """One period of a law that moves the arm by which it is moved (see ``loop.steady_loop``).
 
@@ -271,6 +281,8 @@ def loop_sweep(
         start: (modes, S) complex state of the modes one step before the period.
         memory: (3, S) deflection, the one before and torque there; replaced by those at the end.
         out: (T, S) torque, N m; that of an earlier sweep is replaced.
+        returns: step from which on the period is but a return to where it began, T where it is none: what yields is led to the
+            torque ``begin`` there, N m, smoothly, as a jump would swing the arm.
 
     Returns:
         (modes, S) state at the end, and (S,) largest change of the torque over the largest torque.
@@ -286,7 +298,7 @@ def loop_sweep(
     end = np.empty((len(decay), S), np.complex128)
     x, past, h = memory
     free, free_rate = np.empty(S), np.zeros(S)
-    change, largest = np.zeros(S), np.full(S, 1e-300)
+    change, largest, last = np.zeros(S), np.full(S, 1e-300), np.zeros(S)
     for m in range(len(decay)):
         for i in range(S):
             state = decay[m] * start[m, i] + gain_old[m] * h[i]
@@ -304,7 +316,18 @@ def loop_sweep(
                 p, w = poles[m].real, poles[m].imag
                 for i in range(S):
                     free_rate[i] -= p * re[m, i] - w * im[m, i]
-        if code == 4:
+        if t >= returns:
+            linear_part = a if code == 5 else 0.0
+            share = (t - returns + 1.0) / (T - returns)
+            share = share * share * (3.0 - 2.0 * share)
+            for i in range(S):
+                if t == returns:
+                    last[i] = h[i] - linear_part * x[i]
+                yields = last[i] + share * (begin - last[i])
+                past[i] = x[i]
+                x[i] = (free[i] - direct * yields) / (1.0 + direct * linear_part)
+                h[i] = linear_part * x[i] + yields
+        elif code == 4:
             for i in range(S):
                 h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
         elif damped:

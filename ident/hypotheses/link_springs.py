@@ -6,7 +6,7 @@ import numpy as np
 
 from ident.hypotheses import kernels
 from ident.hypotheses.friction import SMOOTHING, direction
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen
 from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
 
@@ -54,12 +54,14 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
         give = YIELDS * float(np.std(q))
 
         def start(c):
-            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), give if yields else turn]) if max(c[0], c[1]) > 0 else None
+            own = (give, 0.0) if yields else (turn,)
+            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *own]) if max(c[0], c[1]) > 0 else None
 
         if not yields:
             return Screen((q, direction(v, turn)), start)
-        return Screen((q, elastoplastic(q, 1.0 / max(give, 1e-12), 1.0)), start)
+        return Screen((q, elastoplastic(q, 1.0 / max(give, 1e-12), 1.0, begins=motion.group.window is not None)), start)
 
+    own = (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START) if yields else (SMOOTHING,)
     return Hypothesis(
         "dress_pack",
         place,
@@ -68,7 +70,7 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
         (
             Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True, step=1e-3),
             Parameter("friction", "N m", 1e-9, 1e7, log=True, step=1e-3),
-            Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02) if yields else SMOOTHING,
+            *own,
         ),
         None,
         lambda scale: [()],
@@ -76,11 +78,11 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
         options={
-            "loop": lambda p: kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2]) if yields else kernels.Law(kernels.LINK, p[0], p[1], p[2]),
+            "loop": lambda p: kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2], start=p[3]) if yields else kernels.Law(kernels.LINK, p[0], p[1], p[2]),
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the motor.
             "trivial": lambda p, k: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
-            "absorb": lambda p, weights, old: np.array([old[0], p[1], p[2]]),
+            "absorb": lambda p, weights, old: np.array([old[0], *p[1:]]),
             "apart": "friction",
             "special": lambda p: np.array([p[0], 0.0]),
         },

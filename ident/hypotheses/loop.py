@@ -12,7 +12,13 @@ STEADY = 1e-7  # change of the torque from one to the next, over the largest, th
 
 
 def steady_loop(
-    law: Law, linear: np.ndarray, rate: np.ndarray, modes: np.ndarray, guess: np.ndarray | None = None
+    law: Law,
+    linear: np.ndarray,
+    rate: np.ndarray,
+    modes: np.ndarray,
+    guess: np.ndarray | None = None,
+    *,
+    returns: float = 1.0,
 ) -> np.ndarray:
     """Torque (S, T) of a law in steady state with the arm, N m.
 
@@ -26,10 +32,13 @@ def steady_loop(
         linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for laws that see it alone.
         modes: (4, modes) complex, of ``kernels.modal_compliance``.
         guess: (modes, S) complex state from which to begin; rest where None.
+        returns: share of the period from which on it is but a return that closes a motion, in which what yields comes to the ``start``
+            of the law; 1 where there is none.
     """
     code, a, b, k = law[:4]
     S, T = linear.shape
     remembers = code in (HYSTERESIS, CABLE)
+    last = round(returns * T) if remembers else T
     unit = np.array([[1.0], [1.0], [k]])  # of what is remembered, in which it is a deflection
     poles, decay, _, _ = modes
     whole = (decay**T)[:, None]
@@ -47,7 +56,7 @@ def steady_loop(
     past: list[tuple[np.ndarray, np.ndarray]] = []
     for sweep in range(SWEEPS):
         before = memory.copy()
-        end, change = loop_sweep(*law, linear, rate, modes, start, memory, part)
+        end, change = loop_sweep(*law.shape, linear, rate, modes, start, memory, part, last, b * law.start)
         # The state that the torque of this period repeats.
         move = (end - whole * start) / (1.0 - whole) - start
         moving = change > STEADY if sweep else np.ones(len(left), bool)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.hypotheses import kernels
-from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen
+from ident.hypotheses.hypothesis import EXPONENT, START, Hypothesis, Parameter, Screen
 from ident.hypotheses.ripple import SECOND, ripple
 from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
@@ -123,9 +123,9 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
     """Element that yields beside the gear's spring: from a Bouc-Wen one to a Maxwell slip (see ``yielding``)."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        unit = elastoplastic(motion.delta(j), 1.0, shape[0])
+        unit = elastoplastic(motion.delta(j), 1.0, shape[0], begins=motion.group.window is not None)
         return Screen(
-            (unit,), lambda c: np.array([c[0], c[0] * shape[0], ROUNDED, 0.0]) if c[0] > 0 else None, shape
+            (unit,), lambda c: np.array([c[0], c[0] * shape[0], ROUNDED, 0.0, 0.0]) if c[0] > 0 else None, shape
         )
 
     return Hypothesis(
@@ -138,15 +138,16 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
             Parameter("yield_torque", "N m", 1e-9, 1e7, log=True, step=1e-2),
             replace(EXPONENT, center=ROUNDED),
             Parameter("recoil", "1", 0.0, 1.5, nuisance=True, step=0.05, center=0.0, spread=0.5, null=0.0, reported=True),
+            START,
         ),
-        lambda p, delta, k: kernels.Law(kernels.HYSTERESIS, p[0], p[1], k, p[2], p[3]),
+        lambda p, delta, k: kernels.Law(kernels.HYSTERESIS, p[0], p[1], k, *p[2:]),
         lambda scale: [(f * scale.delta[1],) for f in (0.03, 0.1, 0.3, 1.0)],
         screen,
         "The torque of {joint} makes loops against the gear's deflection: an element of {stiffness:.3g} N m/rad"
         " that yields at {yield_torque:.3g} N m.",
         variable="delta",
         options={
-            "size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms, ROUNDED, 0.0]),
+            "size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms, ROUNDED, 0.0, 0.0]),
             "shown": "yield_torque",
         },
     )

@@ -16,8 +16,14 @@ SLIP = 50.0  # exponent from which on the element is a Maxwell slip
 SHORT = 1e-4  # of the deflection at which an element yields: a step whose square is nothing
 
 
-def elastoplastic(x: np.ndarray, stiffness: float, limit: float) -> np.ndarray:
-    """Maxwell slip element: torque of a spring that yields, along one period of a deflection ``x`` (S, T)."""
+def elastoplastic(x: np.ndarray, stiffness: float, limit: float, *, begins: bool = False) -> np.ndarray:
+    """Maxwell slip element: torque of a spring that yields, along one period of a deflection ``x`` (S, T).
+
+    Args:
+        begins: whether it is relaxed where the period begins; else as the period before has left it.
+    """
+    if begins:
+        return onward(np.diff(x, axis=1, prepend=x[:, :1]), stiffness, limit, SLIP, 0.0, np.zeros(len(x)))
     return along_path(x - np.roll(x, 1, axis=1), stiffness, limit, SLIP, 0.0)
 
 
