@@ -254,9 +254,9 @@ def _late(late: LinkDelay, joint: str) -> Cause:
         effect="sensor_delay",
         joint=joint,
         parameters={"delay": Value(late.delay, late.std, "s")},
-        probability=0.95,
-        evidence=f"The link encoder of {joint} comes {late.delay:.3g} s after its motor encoder: their difference"
-        " follows the velocity, which looks like wind-up of the gear and is not.",
+        probability=0.95 if late.clear else 0.6,
+        evidence=f"The link encoder of {joint} comes {late.delay:.3g} s after its motor encoder: their difference follows the velocity, which looks like wind-up of the gear"
+        + (" and is not." if late.clear else "; viscous friction of the link would look the same."),
         alternatives=(),
         channel="q_link",
     )

@@ -20,7 +20,8 @@ from ident.hypotheses.friction import direction
 from ident.problem import Problem
 
 SURE = 5.0  # standard deviations from which a delay is one
-LEAST = 0.1  # delay in samples that is worth a name
+LEAST = 0.02  # delay in samples that is worth a name
+CLEAR = 0.1  # delay in samples from which little else looks like it: viscous friction of the link winds the gear up by its velocity too
 EXPLAINED = 0.5  # share of what stiffness and lost motion leave that it must explain
 BLOCKS = 12  # of lines, left out one after another for the standard deviation
 SMOOTH = 8  # lines on either side over which the remaining power is averaged
@@ -30,11 +31,15 @@ LEAST_NOISE = 1e-7  # of a link encoder over its motion, where differences of sa
 
 @dataclass(frozen=True)
 class LinkDelay:
-    """How late the link encoder of a joint comes, with standard deviation; s."""
+    """How late the link encoder of a joint comes, with standard deviation; s.
+
+    ``clear`` where a viscous friction of the link, which winds up the gear alike, would have to be unlikely large.
+    """
 
     joint: int
     delay: float
     std: float
+    clear: bool = True
 
 
 def comparable_links(problem: Problem) -> bool:
@@ -84,7 +89,7 @@ def find_link_delays(
         ]
         found = _fit_delay(pairs, j) if pairs else None
         if found is not None and found[0] > LEAST * sample_time:
-            out.append(LinkDelay(j, *found))
+            out.append(LinkDelay(j, *found, clear=found[0] > CLEAR * sample_time))
     return tuple(out)
 
 
