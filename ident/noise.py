@@ -20,7 +20,8 @@ SMOOTH_DOF = 80.0  # degrees of freedom wanted of the smoothed scatter
 WINDOWED = 2.0  # neighbouring lines of a spectrum through a window, that count as one
 LEVEL_STEPS = 60  # towards the likeliest levels
 LEAST_LEVEL, MOST_LEVEL = 1e-5, 1e5  # of the noise of the torque, over the quietest line, between which it is sought
-LEVELS = 60  # of it over that range, and as many about the likeliest
+ROUGH_LEVELS, LEVELS = 60, 120  # of it over that range, and over the part of it that is likely
+UNLIKELY = 20.0  # nats below the likeliest level
 LEAST_VARIANCE = 1e-140  # of a line, of records without any noise
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
@@ -171,7 +172,7 @@ def likeliest_levels(power: np.ndarray, gain: np.ndarray, weight: np.ndarray) ->
 def _mean_level(power: np.ndarray, others: np.ndarray, dof: np.ndarray) -> np.ndarray:
     """Mean (n,) over all levels of the torque noise, each as likely as it makes the power (K, n) of lines that hold other noise too.
 
-    Integrals over the logarithm of the level by the trapezoidal rule: over all of its range, and finely where many lines make it sharp.
+    Integrals by the trapezoidal rule over the logarithm of the level, where it is not unlikely: many lines make that narrow.
     """
     least = np.log(np.maximum(np.min(power, axis=0), LEAST_VARIANCE))
 
@@ -179,14 +180,14 @@ def _mean_level(power: np.ndarray, others: np.ndarray, dof: np.ndarray) -> np.nd
         mean = np.exp(x)[:, None] + others
         return -np.sum(dof * (np.log(mean) + power / mean), axis=1) + x
 
-    wide = least + np.linspace(np.log(LEAST_LEVEL), np.log(MOST_LEVEL), LEVELS)[:, None]
-    likely = likelihood(wide)
-    fine = np.take_along_axis(wide, np.argmax(likely, axis=0)[None], axis=0) + (wide[1] - wide[0]) * np.linspace(-1.0, 1.0, LEVELS)[:, None]
-    x = np.concatenate([wide, fine])
-    order = np.argsort(x, axis=0)
-    x, likely = (np.take_along_axis(a, order, axis=0) for a in (x, np.concatenate([likely, likelihood(fine)])))
+    rough = np.linspace(np.log(LEAST_LEVEL), np.log(MOST_LEVEL), ROUGH_LEVELS)
+    seen = likelihood(least + rough[:, None])
+    near = seen > seen.max(axis=0) - UNLIKELY
+    low, high = rough[np.argmax(near, axis=0)], rough[-1 - np.argmax(near[::-1], axis=0)]
+    x = least + np.linspace(low - (rough[1] - rough[0]), high + (rough[1] - rough[0]), LEVELS)
+    likely = likelihood(x)
     share = np.exp(likely - likely.max(axis=0))
-    return np.trapezoid(share * np.exp(x), x, axis=0) / np.trapezoid(share, x, axis=0)
+    return np.sum(share * np.exp(x), axis=0) / np.sum(share, axis=0)
 
 
 def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:

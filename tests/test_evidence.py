@@ -381,7 +381,7 @@ def test_a_cause_begins_beside_the_drives_that_have_taken_its_place(identified, 
     problem, h, j = setup.problem, named["hysteresis", "wrist_1_joint"], 3
     par, extra = result.model.par, 0.3 * result.model.par.stiffness[3]
     softer = replace(par, stiffness=par.stiffness - extra * (np.arange(6) == j))
-    truth = replace(result.model, par=softer, effects=(Effect(h, np.array([extra, 0.8, 20.0, 0.0])),))
+    truth = replace(result.model, par=softer, effects=(Effect(h, np.array([extra, 0.8, 20.0, 0.0, 0.0])),))
     preds = (predictions(problem, m, result.remainders, steps=REMAINDER_STEPS) for m in (result.model, truth))
     problem = recorded_with(problem, *preds)
     moved = fit(problem, result.model)  # the drives take up what they can
@@ -462,7 +462,7 @@ def test_a_step_that_is_cut_to_lead_uphill_does_not_end_a_fit(ur10, named):
     setup, result = identify(run_experiment(plan, [], seed=1, timestep=5e-4))
     problem = setup.problem
     hinge = next(h for h in catalogue(problem.structure) if h.key == ("transverse_elasticity", "elbow_joint") and not h.options["before"])
-    slip = Effect(named["hysteresis", "shoulder_pan_joint"], np.array([5e3, 1.0, 10.0, 0.0]))
+    slip = Effect(named["hysteresis", "shoulder_pan_joint"], np.array([5e3, 1.0, 10.0, 0.0, 0.0]))
     true = replace(result.model, effects=(slip, Effect(hinge, np.array([5e4, 30.0, 0.0]))))
     before, after = (predictions(problem, m, [None] * len(problem.groups), steps=None) for m in (result.model, true))
     problem = recorded_with(problem, before, after)
@@ -834,7 +834,7 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     quiet = Attribution(result, False, 1e-14, (), result, False)
     assert any("p = 1e-14" in note for note in conclude(data, problem, (), result, quiet, None, preds, preds).notes)
     h = named["hysteresis", "elbow_joint"]
-    final = refit(problem, replace(result.model, effects=(Effect(h, np.array([1e3, 1e4, 5.0, 0.0])),)), result.weights, result.remainders)
+    final = refit(problem, replace(result.model, effects=(Effect(h, np.array([1e3, 1e4, 5.0, 0.0, 0.0])),)), result.weights, result.remainders)
     worse = replace(result, costs=1e3 * result.costs)
     found = Round(worse, (Candidate(h, final, 0.0, 1.0),), (), 1.0, 1.0)
     heard = Attribution(worse, True, 0.0, (found,), final, False)
@@ -855,8 +855,8 @@ def test_a_hysteresis_of_which_no_yielding_is_seen_is_not_trusted(named, std, tr
     """Without a limit that the data know it is a spring beside the gear's."""
     yields, rub = named["hysteresis", "elbow_joint"], named["coulomb_friction", "elbow_joint"]
     names = tuple(h.coordinate(q.name) for h in (yields, rub) for q in h.parameters)
-    final, covariance = SimpleNamespace(names=names), np.diag([1e-4, std**2, 2.0, 2.0, 1e-4, 0.1, 2.0])
-    assert shown(Effect(yields, np.array([1e4, 5.0, 5.0, 0.0])), final, covariance) == trusted
+    final, covariance = SimpleNamespace(names=names), np.diag([1e-4, std**2, 2.0, 2.0, 2.0, 1e-4, 0.1, 2.0])
+    assert shown(Effect(yields, np.array([1e4, 5.0, 5.0, 0.0, 0.0])), final, covariance) == trusted
     assert shown(Effect(rub, np.array([5.0, 0.0, 1e-3])), final, covariance)
 
 
@@ -1098,7 +1098,7 @@ def test_a_load_is_the_change_of_its_body(ur10):
 
 def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named):
     _, setup, result = identified
-    model = replace(result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2])),))
+    model = replace(result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2, 0.0])),))
     fitted = refit(setup.problem, model, result.weights, result.remainders, 1)
     cable = Candidate(fitted.model.effects[-1].hypothesis, fitted, 0.0)
     spring = named["gravity_spring", "elbow_joint"].key

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ident.identification import identify, set_up
-from ident.noise import LEVEL_STEPS, _white_levels, likeliest_levels, residual_covariance
+from ident.noise import LEVEL_STEPS, _mean_level, _white_levels, likeliest_levels, residual_covariance
 from ident.problem import predictions
 from ident.transients import ends_of_transients
 
@@ -158,3 +158,16 @@ def test_noise_that_all_records_tell_weighs_each_of_them(single):
     told, alone = (residual_covariance(g, Z, **noise)[0, 0, 0].real for g in (silent, replace(silent, known_noise=None)))
     level = setup.problem.tau_std[0] ** 2 / samples
     assert told > 0.2 * level > 20.0 * alone
+
+
+@pytest.mark.parametrize("lines", [5, 70, 2000])
+@pytest.mark.parametrize("other", [0.0, 1.0, 300.0])
+def test_the_mean_level_is_the_integral_over_all_levels(lines, other):
+    """Where few lines leave it wide, many make it narrow, and where other noise hides it."""
+    rng = np.random.default_rng(lines)
+    others, dof = other * rng.uniform(0.5, 2.0, (lines, 1)), np.full((lines, 1), 2.0)
+    power = (1.0 + others) * rng.gamma(2.0, 0.5, (lines, 1))
+    x = power.min() * np.geomspace(1e-6, 1e6, 20000)
+    likely = np.array([-np.sum(dof * (np.log(v + others) + power / (v + others))) for v in x]) + np.log(x)
+    share = np.exp(likely - likely.max())
+    assert _mean_level(power, others, dof) == pytest.approx(np.sum(share * x) / np.sum(share), rel=1e-4)
