@@ -26,11 +26,11 @@ from ident.refits import (
 )
 from ident.rounds import Round, outdone, temper_of
 from ident.screening import screen, signal_scale
+from ident.search import HOPELESS_RATIO
 from ident.torque_fit import Fit
 
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 SAME_PERIOD = 0.01  # relative, of two ripples
-FAR_BEHIND = 3.0  # times what the best of a contest leaves: a rival that leaves that much more after a few steps is out
 REMATCH = 0.002  # probability from which a rival is weighed against a cause again at the end
 
 
@@ -114,7 +114,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
 def in_reach(ran: Sequence[Candidate]) -> list[Candidate]:
     """The first of the entrants, and those that a few steps have not shown to be far behind the best."""
     best = min((c.fit for c in ran), key=lambda r: r.cost)
-    left = max(FAR_BEHIND * (best.cost - best.count), (DETECTION_EXCESS - 1.0) * best.count)
+    left = max((HOPELESS_RATIO - 1.0) * (best.cost - best.count), (DETECTION_EXCESS - 1.0) * best.count)
     return [c for i, c in enumerate(ran) if i == 0 or c.fit.cost - best.cost <= left]
 
 

@@ -72,8 +72,8 @@ def shifts_posture(model: Model) -> bool:
 
 
 def moves_geometry(effect: Effect, motion: bool) -> bool:
-    """Whether an effect changes the geometric remainder to first order: a change of the arm, and along a motion an error of the position,
-    which shifts gravity and inertia with it."""
+    """Whether an effect changes the geometric remainder to first order: a change of the arm, and along a motion an error of the position
+    or a law of a gear, which shift gravity and inertia with them."""
     return effect.hypothesis.channel == "model" or (motion and effect.hypothesis.channel in ("position", "spring"))
 
 

@@ -178,21 +178,38 @@ def _effect_columns(
     exact: bool,
     posture: np.ndarray | None,
 ) -> list[np.ndarray]:
-    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``, by differences.
+    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``: none by those that the group does not feel.
 
     Args:
         remade: as of ``_differences``.
     """
     effect = model.effects[i]
-    h, steps, top = effect.hypothesis, effect_steps(effect), compared_lines(group)
-    if group.window is None:
-        steps = [s for s, q in zip(steps, h.parameters, strict=True) if not q.at_start]
+    felt = [group.window is not None or not q.at_start for q in effect.hypothesis.parameters]
+    steps = [s for s, f in zip(effect_steps(effect), felt, strict=True) if f]
+    columns = iter(_effect_differences(problem, model, group, pred, remade, effect, steps, exact, posture))
+    none = np.zeros((len(pred.U), compared_lines(group), model.structure.n + len(group.links)), complex)
+    return [next(columns) if f else none for f in felt]
+
+
+def _effect_differences(
+    problem: Problem,
+    model: Model,
+    group: Group,
+    pred: Prediction,
+    remade: Prediction,
+    effect: Effect,
+    steps: Sequence[tuple[np.ndarray, float]],
+    exact: bool,
+    posture: np.ndarray | None,
+) -> list[np.ndarray]:
+    """Change (S, K, n + M) of the predicted outputs by each of some ``steps`` of an effect, over its size; else as ``_effect_columns``."""
+    h, top = effect.hypothesis, compared_lines(group)
     if h.channel == "motor" and not joints_along_record(model, group):
         return [column[:, :top] for column in _motor_columns(model, group, pred, effect, steps)]
     if h.channel == "drive":
         return [column[:, :top] for column in _drive_columns(model, group, pred, effect, steps)]
     models = [
-        Model(model.structure, model.par, tuple(Effect(h, p) if a == i else e for a, e in enumerate(model.effects)))
+        Model(model.structure, model.par, tuple(Effect(h, p) if e is effect else e for e in model.effects))
         for p, _ in steps
     ]
     if exact or moves_geometry(effect, group.window is not None):
@@ -201,9 +218,7 @@ def _effect_columns(
     else:
         base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}
         moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
-    columns = iter([_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)])
-    none = np.zeros((len(pred.U), top, model.structure.n + len(group.links)), complex)
-    return [none if q.at_start and group.window is None else next(columns) for q in h.parameters]
+    return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]
 
 
 def _motor_columns(

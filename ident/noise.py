@@ -176,16 +176,16 @@ def _mean_level(power: np.ndarray, others: np.ndarray, dof: np.ndarray) -> np.nd
     """
     least = np.log(np.maximum(np.min(power, axis=0), LEAST_VARIANCE))
 
-    def likelihood(x: np.ndarray) -> np.ndarray:
+    def log_density(x: np.ndarray) -> np.ndarray:
         mean = np.exp(x)[:, None] + others
         return -np.sum(dof * (np.log(mean) + power / mean), axis=1) + x
 
     rough = np.linspace(np.log(LEAST_LEVEL), np.log(MOST_LEVEL), ROUGH_LEVELS)
-    seen = likelihood(least + rough[:, None])
+    seen = log_density(least + rough[:, None])
     near = seen > seen.max(axis=0) - UNLIKELY
     low, high = rough[np.argmax(near, axis=0)], rough[-1 - np.argmax(near[::-1], axis=0)]
     x = least + np.linspace(low - (rough[1] - rough[0]), high + (rough[1] - rough[0]), LEVELS)
-    likely = likelihood(x)
+    likely = log_density(x)
     share = np.exp(likely - likely.max(axis=0))
     return np.sum(share * np.exp(x), axis=0) / np.sum(share, axis=0)
 

@@ -12,7 +12,7 @@ from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, 
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
 from ident.conclude import _cause, conclude, faint_note
-from ident.contests import same_as_special
+from ident.contests import in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
@@ -1094,6 +1094,13 @@ def test_a_load_is_the_change_of_its_body(ur10):
     loaded, _ = apply_change(bare, par, payload(link).options["change"](p))
     assert payload_like(link, bare, loaded)[:4] == pytest.approx(p[:4])
     assert payload_like(link, loaded, bare) is None
+
+
+@pytest.mark.parametrize(("costs", "kept"), [((1000.0, 1095.0, 1105.0), 2), ((1200.0, 1700.0, 1900.0), 2), ((9000.0, 1000.0, 1020.0), 3)])
+def test_rivals_far_behind_leave_a_contest_and_the_cause_itself_stays(costs, kept):
+    """Of a best one at the noise those within its error of 1,000 data are in reach; else those that leave up to four times as much."""
+    ran = [Candidate(None, SimpleNamespace(cost=c, count=1000), 0.0) for c in costs]
+    assert in_reach(ran) == ran[:kept]
 
 
 def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named):

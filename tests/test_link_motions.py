@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ident.conclude import _late
 from ident.coordinates import pack, unpack
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose, diagnose_fully
 from ident.hypotheses import catalogue
 from ident.identification import set_up
-from ident.link_sensor import LinkDelay, comparable_links, with_link_encoders
+from ident.link_sensor import LinkDelay, comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect, Model
 from ident.problem import data_count, data_counts, predictions
 from ident.weights import make_weights
@@ -96,6 +97,26 @@ def test_the_zero_of_a_link_encoder_does_not_count_and_its_delay_is_taken_back(s
     late = linked(still, (LinkDelay(2, 3e-3, 1e-5),)).problem.groups[0]
     assert late.Q_link[..., 2] == pytest.approx(group.Q_link[..., 2] * np.exp(3e-3j * group.omega))
     assert np.array_equal(late.Q_link[..., 3], group.Q_link[..., 3])
+
+
+@pytest.mark.parametrize(("samples", "named", "clear"), [(0.005, False, None), (0.05, True, False), (0.5, True, True)])
+def test_a_part_of_a_sample_by_which_a_link_encoder_is_late(still, samples, named, clear):
+    """Too little of it has no name; a little is one with viscous friction of the link, which the verdict says."""
+    problem, joint = set_up(still).problem, 2
+    model, step = Model(problem.structure, problem.nominal), problem.sampling.sample_time
+    preds = predictions(problem, model, [None] * len(problem.groups), steps=None)
+    rng, groups = np.random.default_rng(5), []
+    for group, pred in zip(problem.groups, preds, strict=True):
+        links = pred.solution.Q_driven + 1e-9 * rng.normal(size=(*pred.U.shape, 2)) @ [1.0, 1.0j]
+        links[..., joint] *= np.exp(-1j * group.omega * samples * step)
+        groups.append(replace(group, Q_link=links))
+    late = find_link_delays(groups, preds, step)
+    assert [x.joint for x in late] == ([joint] if named else [])
+    for x in late:
+        assert x.delay == pytest.approx(samples * step, rel=0.05) and x.clear == clear
+        cause = _late(x, "elbow_joint")
+        assert (cause.probability > 0.9) == clear and cause.probability > 0.5
+        assert ("friction of the link" in cause.evidence) == (not clear)
 
 
 def test_link_encoders_count_at_their_joints(still):

@@ -58,6 +58,44 @@ def test_softer_gears_move_gravity_and_inertia(moving):
 
 
 @pytest.fixture(scope="module")
+def yielding(moving):
+    """The problem as recorded with an element in a gear that yields and holds 0.6 of its limit where the motion begins, and that effect."""
+    problem, model, _ = moving
+    h = next(h for h in catalogue(problem.structure) if h.key == ("hysteresis", "shoulder_lift_joint"))
+    p = np.array([model.par.stiffness[1], 40.0, 20.0, 0.0, 0.6])
+    true = replace(model, effects=(Effect(h, p),))
+    (pred,) = predictions(problem, true, [None], steps=None)
+    group = problem.groups[0]
+    return replace(problem, groups=(replace(group, U=group.U + pred.U, U_periods=group.U_periods + pred.U[:, None]),)), true, pred
+
+
+def test_what_an_element_holds_where_a_motion_begins_is_felt(yielding):
+    """As one step of the remainder tells it: the element yields a little elsewhere, which the next ones add."""
+    problem, true, pred = yielding
+    group, step = problem.groups[0], 0.02
+    J = jacobian(problem, true, group, pred).dense()[..., -1]
+    ends = [
+        anew(problem, replace(true, effects=(replace(e, p=e.p + sign * step * np.eye(5)[-1]),)), pred)
+        for e in true.effects
+        for sign in (1.0, -1.0)
+    ]
+    slope = group.observe((ends[0] - ends[1]) / (2.0 * step))
+    assert np.linalg.norm(slope) > 0.0
+    assert np.linalg.norm(group.observe(J) - slope) < 0.25 * np.linalg.norm(slope)
+
+
+def test_a_fit_finds_what_an_element_holds_where_a_motion_begins(yielding):
+    """From none of it. It ends a little short of the minimum, where the data would tell it within 0.02."""
+    problem, true, _ = yielding
+    effect = true.effects[0]
+    begun = replace(effect, p=np.array([0.7, 0.8, 1.0, 1.0, 0.0]) * effect.p)
+    found = fit(problem, replace(true, effects=(begun,)), iterations=20)
+    assert found.chi2_per_dof < 1.2
+    assert found.model.effects[0].value("yield_torque") == pytest.approx(40.0, rel=0.05)
+    assert found.model.effects[0].value("start") == pytest.approx(0.6, abs=0.15)
+
+
+@pytest.fixture(scope="module")
 def eccentric(moving):
     """The problem as recorded by an encoder that errs by 10 mrad once a turn, and that effect."""
     problem, model, _ = moving
