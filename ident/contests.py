@@ -26,12 +26,19 @@ from ident.refits import (
 )
 from ident.rounds import Round, outdone, temper_of
 from ident.screening import screen, signal_scale
-from ident.search import HOPELESS_RATIO
+from ident.search import HOPELESS_RATIO, best_named
 from ident.torque_fit import Fit
 
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 SAME_PERIOD = 0.01  # relative, of two ripples
 REMATCH = 0.002  # probability from which a rival is weighed against a cause again at the end
+ALIKE = (  # pairs that are hard to tell apart beside a cause that is missing
+    {"torque_constant", "link_inertia"},
+    {"torque_delay", "torque_lag"},
+    {"sensor_delay", "sensor_lag"},
+    {"cogging", "transmission_error"},
+    {"backlash", "softening_stiffness"},
+)
 
 
 def weighed_again(
@@ -72,7 +79,9 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         return h.key not in there or (h.key == winner.key and loaded[0] != loaded[1])
 
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
-    rivals = [*rivals[:FINALISTS], *as_load(current, own, others), *elsewhere(problem, current, own, others)]
+    rivals = [e for _, e in best_named([(e.hypothesis, e) for e in rivals], FINALISTS)]
+    rivals += [e for e in alike(found, winner) if other(e.hypothesis) and all(e.hypothesis is not x.hypothesis for x in rivals)]
+    rivals += [*as_load(current, own, others), *elsewhere(problem, current, own, others)]
     rivals += wider(problem, current, own) if nearly_settled(current) else []
 
     def entered(effect: Effect) -> Fit | None:
@@ -122,6 +131,13 @@ def same_as_special(candidate: Candidate, ran: Mapping[tuple[str, str], Candidat
     """Whether a candidate is but the special case that it holds, which ran too: a cable that does not rub beside a spring."""
     h = candidate.hypothesis
     return (h.options.get("absorbs"), h.place) in ran and untold(candidate.fit, candidate.fit.model.effects[-1])
+
+
+def alike(found: Round, winner: Hypothesis) -> list[Effect]:
+    """Effects at the joint of a winner that are hard to tell from it, as they were screened: the round may not have tried them."""
+    twins = {e for pair in ALIKE if winner.effect in pair for e in pair - {winner.effect}}
+    scores = [s for s in found.scores if s.hypothesis.effect in twins and s.hypothesis.joint == winner.joint and s.start is not None]
+    return [Effect(s.hypothesis, clip_to_bounds(s.hypothesis, s.start)) for s in scores[:1]]
 
 
 def as_load(current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:

@@ -23,7 +23,7 @@ from ident.parallel import Workers
 from ident.problem import Problem, predictions
 from ident.refits import FAINT, FINALISTS, left_by, refit, reweighted, settled, under_own_noise
 from ident.screening import Score, screen
-from ident.search import MIN_SHARE, STRONG, explore, explore_softly, under_noise_of_best
+from ident.search import MIN_SHARE, STRONG, best_named, explore, explore_softly, under_noise_of_best
 from ident.strong import beside_strong
 from ident.torque_fit import Fit
 
@@ -207,7 +207,7 @@ def beside_unclear(
         bare: as of ``search.explore``.
     """
     direct, scores = explore(problem, current, hypotheses, 0.0, bare, workers)
-    hopefuls = [(h, r) for h, r in direct if not last_is_pointless(r)][:FINALISTS]
+    hopefuls = best_named([(h, r) for h, r in direct if not last_is_pointless(r)], FINALISTS)
     same = workers.map(lambda x: refit(problem, x[1].model, found.before.weights, x[1].remainders), hopefuls)
     known = [(c.hypothesis, c.fit) for c in found.candidates]
     new = [(h, r) for (h, _), r in zip(hopefuls, same, strict=True) if r is not None and all(h is not k for k, _ in known)]

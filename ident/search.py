@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,13 +26,16 @@ from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import ANNEALING, Fit, anneal
 from ident.weights import make_weights
 
+T = TypeVar("T")
+
 CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain where the baseline is hopeless
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
 HOPEFUL = 5  # candidates fitted further after the first steps
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
-REFITS = 8  # candidates refitted in a round
+REFITS = 8  # candidates of the catalogue refitted in a round
+DECOYS = 4  # decoys, at most
 PER_EFFECT = 2  # of one effect, at most
 NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
 NEAR_BODY = 1.0 / 3.0  # the same of a body's inertia, where one answers best
@@ -96,13 +100,13 @@ def explore_softly(
     stage, level = soften(problem, current)
     found, scores = explore(problem, stage, hypotheses, 0.0, ANSWERED, workers, rough=True)
     # Of laws of which nothing is left but a special case, that one goes on.
-    last = [(h, r) for h, r in found if not last_is_pointless(r)][:FINALISTS]
+    last = best_named([(h, r) for h, r in found if not last_is_pointless(r)], FINALISTS)
     softly = {h.key: explained(stage, r, noise=0.0) for h, r in last}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
     ways = [(h, r, (*ladder, sharp)) for h, r in last]
-    ways += [(h, r, (sharp,)) for h, r in direct[:FINALISTS]]
+    ways += [(h, r, (sharp,)) for h, r in best_named(direct, FINALISTS)]
 
     def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> Fit | None:
         _, result, steps = way
@@ -243,17 +247,25 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
     """
     ranked = sorted(found, key=lambda x: x[1].cost)
     limit = HOPELESS_RATIO * max(ranked[0][1].cost - ranked[0][1].count, 0.0) if ranked else 0.0
-    kept = [
-        (h, r) for i, (h, r) in enumerate(ranked[:HOPEFUL]) if i < FINALISTS or (r.cost - r.count < limit and not r.converged)
-    ]
+    near = [(h, r) for h, r in best_named(ranked, HOPEFUL) if r.cost - r.count < limit and not r.converged]
+    kept = best_named(ranked, FINALISTS)
+    kept += [(h, r) for h, r in near if all(h is not k for k, _ in kept)]
     first = [(h, r) for h, r in found[:1] if not r.converged and all(h is not k for k, _ in kept)]
     kept += first
     special = {(h.options.get("absorbs"), h.place) for h, _ in kept}
     return [*kept, *((h, r) for h, r in ranked if h.key in special and all(h is not k for k, _ in kept))]
 
 
+def best_named(ranked: Sequence[tuple[Hypothesis, T]], count: int) -> list[tuple[Hypothesis, T]]:
+    """The first ``count`` of the catalogue, of a ranking, and of the decoys before the last of them: these take no place of a named one."""
+    decoy = np.array([h.decoy for h, _ in ranked], bool)
+    before = np.cumsum(~decoy) - ~decoy  # named ones
+    kept = (before < count) & (~decoy | (np.cumsum(decoy) <= count))
+    return [pair for pair, k in zip(ranked, kept, strict=True) if k]
+
+
 def choose(scores: Sequence[Score]) -> list[Score]:
-    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
+    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times. Decoys take no place of a named one.
 
     A linear step hardly tells where a hinge is: if one is worth a refit, so are those before and after other joints
     that come near it.
@@ -262,10 +274,11 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     top = scores[0].gain if scores else 0.0
     for score in scores:
         same = sum(s.hypothesis.effect == score.hypothesis.effect for s in out)
-        if score.start is None or same == PER_EFFECT or score.gain < KEEP_RATIO * top:
+        decoys = sum(s.hypothesis.decoy for s in out)
+        if score.start is None or same == PER_EFFECT or score.gain < KEEP_RATIO * top or (score.hypothesis.decoy and decoys == DECOYS):
             continue
         out.append(score)
-        if len(out) == REFITS:
+        if len(out) - decoys == REFITS and not score.hypothesis.decoy:
             break
     hinges = [s for s in out if "hinge" in s.hypothesis.options]
     taken = {_side(s) for s in hinges}

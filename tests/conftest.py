@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from ident.dataset_io import load_dataset, save_dataset
 from ident.excitation import operating_points
@@ -11,6 +12,8 @@ from ident.identification import identify
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import draw_drives, plan_experiment
+
+threadpool_limits(1)  # workers share the cores: threads of each would only wait for each other, ten times as long
 
 
 def small_plan(robot, seed, *, points=2, levels=(1.0, 0.4), period=2000, validation_points=1, trajectory=False, **kwargs):

@@ -73,6 +73,31 @@ def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path, power, coe
 
 
 @pytest.mark.slow
+def test_a_torque_constant_that_falls_with_time_gets_no_name(ur10, tmp_path):
+    """The catalogue holds one that is wrong, and a friction that drifts: neither is this, nor are both together."""
+    from dataclasses import dataclass
+
+    @dataclass(frozen=True)
+    class Warming:
+        place: str
+        change: float
+        time_constant: float
+
+        def deliver(self, run):
+            def delivered(u, step):
+                return u * (1.0 + self.change * np.expm1(-(run.start + step * run.step) / self.time_constant))
+
+            return delivered
+
+    drives = draw_drives(np.random.default_rng(12), ur10)
+    data = run_experiment(small_plan(ur10, 12), [Warming("elbow_joint", 0.06, 100.0)], seed=12, drives=drives)
+    verdict = diagnose(through_files(data, tmp_path))
+    assert verdict.discrepancy.detected
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    assert all(c.probability <= 0.5 for c in verdict.causes)
+
+
+@pytest.mark.slow
 def test_friction_of_every_joint_counts_once(ur10, tmp_path):
     """A real arm rubs everywhere: with one round the same effect is found at all joints that have it."""
     from sim import parse_effect

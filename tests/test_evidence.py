@@ -12,7 +12,7 @@ from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, 
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
 from ident.conclude import _cause, conclude, faint_note
-from ident.contests import in_reach, same_as_special
+from ident.contests import alike, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
@@ -47,7 +47,7 @@ from ident.refits import polish, refit, reweighted, settled, turned, under_own_n
 from ident.reporting import frf_views, most_affected
 from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
 from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
-from ident.search import PER_EFFECT, STRONG, begin, choose, explore, other_bodies
+from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, choose, explore, other_bodies
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
 from ident.trust import shadowed, shown
@@ -800,6 +800,31 @@ def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
     assert other_bodies(found, tried, scores) == [scores[3]]
     better = [*found, (rub.hypothesis, SimpleNamespace(cost=0.5))]
     assert other_bodies(better, tried, scores) == [] == other_bodies([], tried, scores)
+
+
+def test_decoys_take_no_place_of_a_named_one(named):
+    joints = ("shoulder_pan_joint", "elbow_joint")
+    effects = ("unknown:drag_2", "unknown:drag_3", "unknown:rising_friction", "coulomb_friction", "torque_lag", "cogging", "torque_constant", "backlash")
+    laws = [named[effect, joint] for effect in effects for joint in joints]
+    scores = [SimpleNamespace(hypothesis=h, gain=1.0 - 0.01 * i, start=np.ones(3)) for i, h in enumerate(laws)]
+    chosen = [s.hypothesis for s in choose(scores)]
+    assert chosen == laws[:DECOYS] + laws[6 : 6 + REFITS]
+    kept = best_named([(h, i) for i, h in enumerate(chosen)], 3)
+    assert kept == [*((h, i) for i, h in enumerate(laws[:3])), *((h, DECOYS + i) for i, h in enumerate(laws[6:9]))]
+    behind = best_named([(h, None) for h in (*laws[6:9], laws[0])], 3)
+    assert [h for h, _ in behind] == laws[6:9] and best_named([], 3) == []
+
+
+def test_a_cause_meets_those_that_are_hard_to_tell_from_it_though_its_round_has_not_tried_them(named):
+    heavy, scale = named["link_inertia", "forearm_link"], named["torque_constant", "elbow_joint"]
+    assert heavy.joint == scale.joint
+    others = [named["torque_constant", "wrist_1_joint"], named["cogging", "elbow_joint"], scale, named["torque_lag", "elbow_joint"]]
+    scores = tuple(SimpleNamespace(hypothesis=h, start=np.array([1.1])) for h in others)
+    found = Round(None, (Candidate(heavy, None, 0.0, 1.0),), scores, 1.0, 1.0)
+    (twin,) = alike(found, heavy)
+    assert twin.hypothesis is scale and twin.p == pytest.approx([1.1])
+    unphysical = tuple(SimpleNamespace(hypothesis=s.hypothesis, start=None) for s in scores)
+    assert alike(replace(found, scores=unphysical), heavy) == [] == alike(found, named["dress_pack", "elbow_joint"])
 
 
 def test_a_search_tries_other_bodies_where_one_answers_best(ur10, named, tmp_path):

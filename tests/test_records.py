@@ -159,6 +159,23 @@ def test_friction_at_rest_balances_what_the_drive_delivers(scale):
     assert left(scale) < 1.2 * max(left(1.0), left(1.0) / scale)
 
 
+def test_what_a_motor_delivers_while_it_warms_up_is_told_by_the_decoy_for_it():
+    change, time_constant = -0.3, 6.0
+    delivered = 1.0 + change * -np.expm1(-np.arange(7250) / RATE / time_constant)
+
+    def left(scale, *effects):
+        setup = set_up(moves_with_dwells(0.0, scale))
+        problem, (group,) = setup.problem, setup.problem.groups
+        known = {h.effect: h for h in catalogue(problem.structure)}
+        there = tuple(Effect(known[name], np.array(p)) for name, p in effects)
+        found = predict(Model(problem.structure, problem.nominal, there), group, problem.sampling)
+        return float(np.sqrt(np.mean(np.abs(group.observe(group.U - found.U)) ** 2)))
+
+    clean = left(1.0)
+    assert left(delivered) > 3.0 * clean
+    assert left(delivered, ("unknown:torque_drift", (1.0, change, time_constant))) == pytest.approx(clean, rel=0.05)
+
+
 def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     """A motion that is cut while the torque rises: its return swings far beyond, and was never asked of the motor."""
     bench, fs = load_robot("twomass"), RATE

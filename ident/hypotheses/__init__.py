@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from ident.chain import Structure
-from ident.hypotheses import bodies, drive, friction, hinges, link_springs, sensing, structure, transmission
+from ident.hypotheses import bodies, drifts, drive, friction, hinges, link_springs, sensing, structure, transmission
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from robot_assets.robot import linear_joints
 
@@ -57,6 +57,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         out.append(friction.rising_friction(j, name))
         out.append(friction.position_friction(j, name))
         out.append(structure.link_friction(j, name))
+        out.append(drifts.torque_drift(j, name))
         if offsets:
             out.append(sensing.constant_torque(j, name))
         if robot.joints[j].gear_ratio != 1.0:

@@ -9,6 +9,7 @@ from ident.hypotheses.ripple import SECOND, ripple
 from ident.motion import Motion
 
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
+SCALE = Parameter("scale", "1", 0.2, 5.0, log=True)  # delivered torque over the recorded one
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
 
@@ -23,7 +24,7 @@ def torque_constant(joint: int, place: str) -> Hypothesis:
         place,
         joint,
         "drive",
-        (Parameter("scale", "1", 0.2, 5.0, log=True),),
+        (SCALE,),
         lambda p, motion, j, k, U: U / p[0],
         lambda scale: [()],
         screen,

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.group import Group
+from ident.hypotheses.drifts import CHANGE, TIME_CONSTANT, time_constants, warmth
 from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.kernels import smooth_sign
 from ident.hypotheses.yielding import DAHL, bristle
@@ -274,16 +275,16 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
     Viscous and Coulomb friction change alike; ``relative_change`` is negative where they fall.
     """
 
-    def warmth(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray]:
-        return motion.par.viscous[j] * motion.v(j), 1.0 - np.exp(-motion.time / tau)
+    def warming(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray]:
+        return motion.par.viscous[j] * motion.v(j), warmth(motion, tau)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        drag, warm = warmth(motion, j, p[1])
+        drag, warm = warming(motion, j, p[1])
         return dry(motion, j, p[3], p[2] * (1.0 + p[0] * warm)) + p[0] * warm * drag
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         smoothing = 2e-3 * np.sqrt(np.mean(motion.v(j) ** 2))
-        drag, warm = warmth(motion, j, shape[0])
+        drag, warm = warming(motion, j, shape[0])
         s = sense(motion, j, smoothing)
 
         def start(c):
@@ -304,13 +305,13 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         joint,
         "motor",
         (
-            Parameter("relative_change", "1", -0.98, 5.0, step=1e-3, center=0.0, spread=0.5, null=0.0),
-            Parameter("time_constant", "s", 1.0, 1e5, log=True, step=1e-2),
+            CHANGE,
+            TIME_CONSTANT,
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True, reported=True),
             SMOOTHING,
         ),
         law,
-        lambda scale: [(f * scale.duration,) for f in (0.1, 0.3, 1.0)] if scale.duration > 0 else [],
+        time_constants,
         screen,
         "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
         " of {time_constant:.0f} s; {coulomb:.3g} N m of it is Coulomb friction, at the start.",

@@ -7,7 +7,7 @@ may define any of:
     edit(spec, robot, drives)                    native MuJoCo elements
     torque(run) -> step(State) -> Torque         a torque at every integration step
     dry(run) -> step(State) -> Dry               the size of a dry friction at every step (see ``dry``)
-    deliver(run) -> step(u, State) -> u          what becomes of the commanded torque
+    deliver(run) -> step(u, index) -> u          what becomes of the commanded torque (S,) of its joint
     measure(run) -> step(State) -> (S,) rad      what the encoder shows of its joint
 """
 
