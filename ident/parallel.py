@@ -17,8 +17,7 @@ import cloudpickle
 from threadpoolctl import threadpool_limits
 
 from robot_assets.errors import DataError
-
-THREADS_VARIABLE = "SIMGAP_THREADS"
+from robot_assets.threads import THREADS_VARIABLE, thread_count
 
 Arguments = ParamSpec("Arguments")
 Item = TypeVar("Item")
@@ -39,16 +38,6 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
         return [function(x) for x in items]
     with ThreadPoolExecutor(max_workers=threads) as pool:
         return list(pool.map(function, items))
-
-
-def thread_count() -> int:
-    """Threads that a process uses: ``SIMGAP_THREADS``, else one per core."""
-    given = os.environ.get(THREADS_VARIABLE, "")
-    if not given:
-        return os.cpu_count() or 1
-    if not given.isdecimal() or int(given) == 0:
-        raise DataError(THREADS_VARIABLE, "environment", given, "a whole number of threads, 1 or more")
-    return int(given)
 
 
 def one_thread_each(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from mujoco.batch import Batch
 
+from robot_assets.threads import thread_count
 from sim.effects.dry import resistance
 from sim.effects.effect import Run, State
 from sim.plant import Plant, free_inertia, without_engine_log
@@ -73,7 +74,7 @@ def run_loop(
     S, n = len(qpos), plant.robot.n
     h = plant.model.opt.timestep
     substeps = round(1 / (sample_rate * h))
-    batch = Batch(plant.model, S, nthread=2)
+    batch = Batch(plant.model, S, nthread=thread_count())
     x, v, force = batch.bind("qpos"), batch.bind("qvel"), batch.bind("qfrc_applied")
     x[:] = qpos
     run = Run(S, h, 1 / sample_rate, plant.robot, plant.drives, plant.model, start)

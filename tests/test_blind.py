@@ -9,6 +9,7 @@ from sim.effects import parameters_of
 from sim.experiment import draw_drives
 from tests.conftest import small_plan, through_files
 
+LINEAR = {"torque_constant", "torque_delay", "payload"}  # one level tells them
 STRENGTH = {"coulomb_friction": 0.4, "hardening_stiffness": 4.0}  # seen, and the joint still slips
 CASES = {
     "coulomb_friction": ("torque",),
@@ -24,9 +25,8 @@ def hide(robot, name, seed, folder):
     """A dataset with one effect of a kind; place, size and drives drawn."""
     rng = np.random.default_rng(seed)
     effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH.get(name, 2.0))
-    data = run_experiment(
-        small_plan(robot, seed), [effect], seed=seed, drives=draw_drives(rng, robot), timestep=5e-4
-    )
+    plan = small_plan(robot, seed, levels=(1.0,) if name in LINEAR else (1.0, 0.4))
+    data = run_experiment(plan, [effect], seed=seed, drives=draw_drives(rng, robot), timestep=5e-4)
     return effect, through_files(data, folder)
 
 
@@ -64,7 +64,7 @@ def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path, power, coe
             return drag
 
     drives = draw_drives(np.random.default_rng(3), ur10)
-    data = run_experiment(small_plan(ur10, 3), [Drag("elbow_joint")], seed=3, drives=drives)
+    data = run_experiment(small_plan(ur10, 3, levels=(1.0,)), [Drag("elbow_joint")], seed=3, drives=drives)
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
     assert verdict.unexplained_verdict == "unknown cause remains"

@@ -173,7 +173,7 @@ def test_skews_are_estimated_within_their_deviation(name, late):
         assert abs(k.late - late) < 4 * k.std + 2e-4 and k.std < 1e-3, k
 
 
-@pytest.mark.parametrize("name", ["ur10_bare", pytest.param("panda_bare", marks=pytest.mark.slow), "emps"])
+@pytest.mark.parametrize("name", ["emps", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ur10_bare", "panda_bare"))])
 def test_skews_of_less_than_a_sample_are_said_where_they_are_sure(name):
     robot, rate, found = load_robot(name), 250.0, {0.0: [], 0.6: [], -0.5: []}
     for seed in range(3):

@@ -51,7 +51,7 @@ def test_the_slope_of_what_noise_adds_is_its_derivative(identified, named):
 def noisy(ur10):
     """(problem, true parameters) at ten times the noise of the arm."""
     drives = draw_drives(np.random.default_rng(6), ur10)
-    problem = set_up(run_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0)).problem
+    problem = set_up(run_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0, timestep=5e-4)).problem
     names = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
     return problem, replace(problem.nominal, **{mine: drives[its] for mine, its in names.items()})
 
@@ -72,6 +72,7 @@ def test_noise_of_the_position_moves_no_parameter(noisy, monkeypatch):
     assert np.sqrt(np.mean(off() ** 2)) > 2.0 and np.abs(off()).max() > 5.0
 
 
+@pytest.mark.slow
 def test_noise_of_the_position_moves_no_parameter_in_a_single_period(ur10, monkeypatch):
     """The same where the end of a transient alone tells of the noise."""
     drives = draw_drives(np.random.default_rng(6), ur10)

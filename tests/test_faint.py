@@ -45,7 +45,7 @@ def hypotheses(identified):
 def test_an_effect_within_the_error_of_the_noise_is_found(ur10, tmp_path, faint, beside):
     """Alone, and beside another one that is not faint."""
     effects = [parse_effect(text, ur10) for text in (*beside, faint)]
-    data = run_experiment(small_plan(ur10, 31), effects, seed=31, drives=draw_drives(np.random.default_rng(31), ur10))
+    data = run_experiment(small_plan(ur10, 31), effects, seed=31, drives=draw_drives(np.random.default_rng(31), ur10), timestep=5e-4)
     verdict = diagnose(through_files(data, tmp_path))
     name, value = SIZES[faint]
     sure = {(c.effect, c.joint): c for c in verdict.causes if c.probability > 0.5}
@@ -124,7 +124,7 @@ def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside
     hidden = parse_effect("payload@flange:mass=0.5,com_x=0.02,com_y=0.03,com_z=0.08", ur10)
 
     def recorded(effects, folder):
-        data = run_experiment(small_plan(ur10, 5, levels=(1.0,), periods=2, validation_points=0), effects, seed=5, noise=0.0)
+        data = run_experiment(small_plan(ur10, 5, levels=(1.0,), periods=2, validation_points=0), effects, seed=5, noise=0.0, timestep=5e-4)
         rng = np.random.default_rng(7)
 
         def coloured(x, std):

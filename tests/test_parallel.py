@@ -7,9 +7,10 @@ from multiprocessing import get_context
 import pytest
 
 from ident.diagnosis import diagnose
-from ident.parallel import Workers, map_threads, open_executor, thread_count
+from ident.parallel import Workers, map_threads, open_executor
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
+from robot_assets.threads import thread_count
 from sim import parse_effect, run_experiment
 from tests.conftest import small_plan, through_files
 

@@ -76,7 +76,7 @@ def test_a_joint_within_one_step_has_white_errors():
     assert rounding_error(Q, 1e-4, 0.7, 4000, 20) == pytest.approx(np.full(20, 1e-8 / 12 / 4000))
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_beside_an_encoder_in_steps_nothing_is_left_but_noise(tmp_path, seed):
     """A loop that hunts between steps of 45 times the encoder's noise, at two levels: chi-square stays that of noise."""
     robot = load_robot("ur10")
