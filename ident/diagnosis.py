@@ -270,6 +270,8 @@ def with_inertias(
         baseline = fit_baseline(problem, workers.say, offsets)
     except NOT_COMPUTED:
         return setup, result, None
+    if left_over(baseline, result.baseline) > 1.0:  # no better to begin with than the links of the description
+        return setup, result, None
     other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
     if left_over(other.final, result.final) > SETTLED_BY_INERTIAS:
         return setup, result, None

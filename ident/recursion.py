@@ -7,6 +7,7 @@ and goes joint by joint over a block of points that stays in the cache. Same num
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
@@ -70,7 +71,7 @@ def along_z(chain: Chain) -> tuple[np.ndarray, ...]:
 
     To turn by a joint is a few products there.
     """
-    z = np.array([_with_z(e) for e in chain.axis])
+    z = np.array([_with_z(tuple(e)) for e in chain.axis.tolist()])
     before = np.where((chain.parent < 0)[:, None, None], np.eye(3), z[chain.parent])
     to_frame, from_parent = z.swapaxes(1, 2), before.swapaxes(1, 2)
     return (
@@ -85,8 +86,9 @@ def along_z(chain: Chain) -> tuple[np.ndarray, ...]:
     )
 
 
-def _with_z(axis: np.ndarray) -> np.ndarray:
-    """(3, 3) a rotation whose third column is a unit vector."""
+@lru_cache(maxsize=1024)
+def _with_z(axis: tuple[float, float, float]) -> np.ndarray:
+    """(3, 3) a rotation whose third column is a unit vector; axes stay while all else is fitted."""
     other = np.eye(3)[np.argmin(np.abs(axis))]
     x = np.cross(other, axis)
     x /= np.linalg.norm(x)

@@ -9,7 +9,6 @@ from sim.effects import parameters_of
 from sim.experiment import draw_drives
 from tests.conftest import small_plan, through_files
 
-LINEAR = {"torque_constant", "torque_delay", "payload"}  # one level tells them
 STRENGTH = {"coulomb_friction": 0.4, "hardening_stiffness": 4.0}  # seen, and the joint still slips
 CASES = {
     "coulomb_friction": ("torque",),
@@ -25,7 +24,7 @@ def hide(robot, name, seed, folder):
     """A dataset with one effect of a kind; place, size and drives drawn."""
     rng = np.random.default_rng(seed)
     effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH.get(name, 2.0))
-    plan = small_plan(robot, seed, levels=(1.0,) if name in LINEAR else (1.0, 0.4))
+    plan = small_plan(robot, seed, levels=(1.0,))
     data = run_experiment(plan, [effect], seed=seed, drives=draw_drives(rng, robot), timestep=5e-4)
     return effect, through_files(data, folder)
 

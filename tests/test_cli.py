@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import ident
@@ -105,6 +106,11 @@ def test_shipped_real_data_are_diagnosed(tmp_path):
     assert json.loads(run.stdout)["sentence"] == verdict["sentence"]
     assert verdict["discrepancy"]["detected"]
     assert not [c for c in verdict["causes"] if c["probability"] > 0.5]
+    found = verdict["baseline"]["parameters"]
+    assert np.sqrt(found["stiffness.drive"]["value"] / 0.00477) / 2 / np.pi == pytest.approx(54.05, abs=1.5)
+    assert 1 / found["motor_inertia.drive"]["value"] == pytest.approx(209, rel=0.08)
+    assert "link_friction.drive" in found and verdict["gain"]["method"] == "validation segments"
+    assert verdict["gain"]["after"] < 0.3 * verdict["gain"]["before"]
     assert {p.name for p in out.iterdir()} >= {"report.html", "recording.rrd", "model.xml", "model.toml"}
 
 

@@ -104,7 +104,7 @@ def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints
     assert np.all(found < 2.5 * true)
 
 
-@pytest.mark.parametrize("coloured", [False, True])
+@pytest.mark.parametrize("coloured", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tmp_path_factory, monkeypatch, coloured):
     """A ripple shows at lines that nothing excites as at the others; what is still left there beside it is noise."""
     plan = small_plan(ur10, 35, points=2, periods=2, transient_periods=1)

@@ -36,6 +36,7 @@ def test_the_import_agrees_with_the_published_si_signals(bench):
     assert len(s.excited_lines) == 60 and s.excited_lines[0] == 13 and s.excited_lines[-1] == 249
 
 
+@pytest.mark.slow
 def test_the_whole_path_on_real_data(bench):
     result = diagnose_fully(bench)
     p, verdict = result.parameters, result.verdict

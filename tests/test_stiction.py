@@ -129,7 +129,7 @@ def test_dry_friction_that_sticks_leaves_little():
     assert unknown[-1] > 50.0 * left[-1]
 
 
-@pytest.mark.parametrize("static", [COULOMB, STATIC])
+@pytest.mark.parametrize("static", [pytest.param(COULOMB, marks=pytest.mark.slow), STATIC])
 def test_friction_that_sticks_is_named(static):
     verdict = diagnose(sticking(static)[0], max_causes=2)
     effect = "coulomb_friction" if static == COULOMB else "stribeck_friction"
