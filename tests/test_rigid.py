@@ -8,15 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ident.attribute import Attribution
 from ident.chain import LinkChange, build_structure
 from ident.dataset import Dataset, Segment
-from ident.diagnosis import diagnose_fully
+from ident.diagnosis import diagnose_fully, with_inertias
 from ident.extended import predict
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
 from ident.hypotheses.sensing import torque_offset
 from ident.identification import identify, set_up, with_held_out
 from ident.model import Effect, Model
+from ident.parallel import Workers
 from ident.position_lines import wave_numbers
 from ident.problem import predictions
 from ident.pruning import plainer
@@ -185,6 +187,20 @@ def test_friction_is_named_beside_links_that_differ_from_their_description(moved
     assert verdict.gain.gap_closed > 0.95
     assert "inertias of 6 links" in verdict.notes[0] and verdict.baseline["mass.elbow_joint"].unit == "kg"
     assert set(result.inertias) and result.inertias["wrist_3_joint"].mass > 0
+
+
+@pytest.mark.parametrize(("left", "sought"), [(0.5, True), (2.0, False)])
+def test_inertias_that_do_worse_than_the_description_are_left_at_once(moved, monkeypatch, left, sought):
+    """Where the first model with them leaves more than that without, causes are not sought beside them."""
+    setup, first = identify(moved)
+    found = Attribution(first, True, 0.0, (), first, True)
+    worse = replace(first, costs=left * first.costs)
+    asked = []
+    monkeypatch.setattr("ident.diagnosis.carried_over", lambda *args: 0.0)
+    monkeypatch.setattr("ident.diagnosis.fit_baseline", lambda *args: worse)
+    monkeypatch.setattr("ident.diagnosis.attribute", lambda *args, **kwargs: asked.append(args[1]) or found)
+    assert with_inertias(setup, found, 1, Workers()) == (setup, found, None)
+    assert asked == [worse] * sought
 
 
 @pytest.mark.slow
