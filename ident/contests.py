@@ -38,6 +38,7 @@ ALIKE = (  # pairs that are hard to tell apart beside a cause that is missing
     {"sensor_delay", "sensor_lag"},
     {"cogging", "transmission_error"},
     {"backlash", "softening_stiffness"},
+    {"coulomb_friction", "dress_pack"},
 )
 
 

@@ -18,7 +18,7 @@ from ident.costs import weighted_cost
 from ident.evidence import explained, last_is_pointless
 from ident.extended import Prediction
 from ident.hypotheses import Hypothesis
-from ident.model import Model, has_rough_law, is_along_record
+from ident.model import Model, has_loop, has_rough_law, is_along_record
 from ident.parallel import Workers
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
 from ident.refits import FAINT, FINALISTS, FIRST_STEPS, either_turn, extended_by, left_by, refit, reweighted, turned
@@ -200,10 +200,11 @@ def explore(
     if not workers.late:
         found += begun(other_bodies(found, chosen, scores))
     # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law along the
-    # record, or under which a record may be in another steady motion, leaves that much itself.
+    # record, under which a record may be in another steady motion, or that is solved as a loop, leaves that much itself.
     seen = np.setdiff1d(np.arange(len(stage.counts)), list(quiet))
     allowed = (DETECTION_EXCESS - 1.0) * np.sum(stage.counts[seen])
-    unclear = stage.chi2_per_dof <= FAINT and not has_rough_law(stage.model) and left_by(found, seen) > allowed
+    rough_law = has_rough_law(stage.model) or any(map(has_loop, stage.model.effects))
+    unclear = stage.chi2_per_dof <= FAINT and not rough_law and left_by(found, seen) > allowed
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)

@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.diagnosis import diagnose
+from ident.hypotheses import catalogue
 from ident.hypotheses.ripple import ripple
+from ident.problem import predictions
 from sim import parse_effect, run_experiment
 from sim.effects.effect import Torque
 from sim.effects.transmission import carried
@@ -55,6 +57,28 @@ class UnevenGear:
 def uneven_motor(robot, size):
     waves = [(size, 202.0, 0.0), (0.2 * size, 404.0, -1.0)]
     return [parse_effect(f"cogging@elbow_joint:amplitude={a},periods_per_rev={n},phase={p}", robot) for a, n, p in waves]
+
+
+def test_a_ripple_that_grows_with_the_torque_is_asked_for_in_advance(identified):
+    """What the decoy says is recorded gives what the motor delivers, once it ripples; its screening is the derivative."""
+    _, setup, result = identified
+    problem, j = setup.problem, 2
+    h = next(h for h in catalogue(problem.structure) if h.key == ("unknown:torque_ripple", "elbow_joint"))
+    group = problem.groups[0]
+    motion = predictions(problem, result.model, result.remainders)[0].motion(group)
+    U, k, p = motion.solution.U[..., j], result.model.par.stiffness[j], np.array([0.03, 100.0, 0.02])
+
+    def told(part):
+        return h.law(part * p + np.array([0.0, (1.0 - part) * p[1], 0.0]), motion, j, k, U)
+
+    q = p[1] * motion.q(j)
+    gain = 1.0 + p[0] * np.sin(q) + p[2] * np.cos(q)
+    back = motion.lines(gain * group.to_time(told(1.0)[..., None])[..., 0])
+    assert np.linalg.norm(back - U) < 0.02 * np.linalg.norm(told(1.0) - U)
+    made = h.screen(motion, j, k, (p[1],))
+    unit = sum(w * motion.lines(x) for w, x in zip(p[[0, 2]], made.signals, strict=True))
+    assert np.linalg.norm((told(1e-4) - U) / 1e-4 - unit) < 1e-3 * np.linalg.norm(unit)
+    assert made.start(np.array([0.03, 0.02])) == pytest.approx(p)
 
 
 @pytest.mark.parametrize("name", ["cogging", pytest.param("transmission_error", marks=pytest.mark.slow)])

@@ -57,7 +57,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         out.append(friction.rising_friction(j, name))
         out.append(friction.position_friction(j, name))
         out.append(structure.link_friction(j, name))
-        out.append(drifts.torque_drift(j, name))
+        out += [drifts.torque_drift(j, name), drive.torque_ripple(j, name)]
         if offsets:
             out.append(sensing.constant_torque(j, name))
         if robot.joints[j].gear_ratio != 1.0:

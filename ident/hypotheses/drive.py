@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
@@ -10,6 +12,7 @@ from ident.motion import Motion
 
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
 SCALE = Parameter("scale", "1", 0.2, 5.0, log=True)  # delivered torque over the recorded one
+MOST_RIPPLE = 0.5  # of the torque of a motor, that ripples with it
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
 
@@ -150,6 +153,39 @@ def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothe
         screen,
         "The residual torque of {joint} is periodic in its motor angle: {amplitude:.3g} N m,"
         " {periods_per_rev:.4g} periods a turn of the joint.",
+        variable="q",
+    )
+
+
+def torque_ripple(joint: int, place: str) -> Hypothesis:
+    """Decoy: a ripple that grows with the torque, ``1 + fraction sin(periods_per_rev q + phase)`` times the recorded one.
+
+    So do the flux of a motor and currents that are measured with an error of their scale.
+    """
+
+    def asked(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
+        sine, n, cosine = p
+        if not np.any(U):  # nothing ripples by nothing
+            return U
+        q = n * motion.q(j)
+        more = 1.0 / (1.0 + sine * np.sin(q) + cosine * np.cos(q)) - 1.0
+        return U + motion.lines(more * motion.group.to_time(U[..., None])[..., 0])
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        q, u = shape[0] * motion.q(j), motion.group.to_time(motion.solution.U[..., j : j + 1])[..., 0]
+        return Screen((-np.sin(q) * u, -np.cos(q) * u), lambda c: np.array([c[0], shape[0], c[1]]), shape)
+
+    part = Parameter("sine", "1", -MOST_RIPPLE, MOST_RIPPLE, spread=0.05)
+    return Hypothesis(
+        "unknown:torque_ripple",
+        place,
+        joint,
+        "drive",
+        (part, Parameter("periods_per_rev", "1", 0.3, 1e5, step=1e-3), replace(part, name="cosine")),
+        asked,
+        lambda scale: [(n,) for n in scale.wave_numbers],
+        screen,
+        "The torque that the motor of {joint} delivers of the recorded one is periodic in its motor angle.",
         variable="q",
     )
 
