@@ -46,7 +46,15 @@ def test_diagnose_writes_everything(dataset, tmp_path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"verdict.json", "report.html", "recording.rrd", "model.toml", "model.xml"}
 
 
-def test_diagnose_takes_an_executor_and_a_time(dataset, tmp_path):
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """(dataset of a drive with friction as the command writes it, what the command returned)."""
+    folder = tmp_path_factory.mktemp("bench") / "d"
+    return folder, simgap("experiment", "twomass", "--out", folder, "--effect", "coulomb_friction@drive:torque=0.3", "--points", 1, "--quiet")
+
+
+def test_diagnose_takes_an_executor_and_a_time(bench, tmp_path):
+    dataset, _ = bench
     run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--executor", "cores")
     assert run.returncode == 2 and "--executor" in run.stderr and not (tmp_path / "out").exists()
     run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--executor", "processes:2", "--max-seconds", 0, "--json", "--quiet")
@@ -54,10 +62,10 @@ def test_diagnose_takes_an_executor_and_a_time(dataset, tmp_path):
     assert "0 s for the search" in json.loads(run.stdout)["notes"][-1]
 
 
-def test_experiment_writes_a_dataset_that_checks(tmp_path):
-    run = simgap("experiment", "twomass", "--out", tmp_path / "d", "--effect", "coulomb_friction@drive:torque=0.3", "--points", 1, "--quiet")
+def test_experiment_writes_a_dataset_that_checks(bench):
+    dataset, run = bench
     assert run.returncode == 0, run.stderr
-    assert simgap("check", tmp_path / "d").returncode == 0
+    assert simgap("check", dataset).returncode == 0
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def swing(model, amplitude, frequency, turns=2.0):
 def test_cogging_is_a_sine_of_the_motor_angle(bench):
     model, data = exported(bench, cause("cogging", JOINT, amplitude=0.5, periods_per_rev=101.3, phase=0.4))
     q = np.linspace(-3, 3, 50)
-    assert np.allclose(forced(model, data, q, 0 * q), -0.5 * np.sin(101.3 * q + 0.4), atol=1e-12)
+    assert np.allclose(forced(model, data, q, 0 * q), 0.5 * np.sin(101.3 * q + 0.4), atol=1e-12)
 
 
 def test_coulomb_friction_is_asymmetric_and_turns_within_a_step(bench):

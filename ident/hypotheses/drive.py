@@ -125,16 +125,16 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
 
 
 def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothesis:
-    """``amplitude sin(periods_per_rev q + phase)`` at the motor, with a second harmonic."""
+    """``amplitude sin(periods_per_rev q + phase)`` that drives the motor, as MuJoCo's own element does, with a second harmonic."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         sine, n, cosine, *second = p
-        return ripple(sine, cosine, second, n * motion.q(j))[0]
+        return -ripple(sine, cosine, second, n * motion.q(j))[0]
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q = motion.q(j)
         return Screen(
-            (np.sin(shape[0] * q), np.cos(shape[0] * q)), lambda c: np.array([c[0], shape[0], c[1], 0.0, 0.0]), shape
+            (-np.sin(shape[0] * q), -np.cos(shape[0] * q)), lambda c: np.array([c[0], shape[0], c[1], 0.0, 0.0]), shape
         )
 
     return Hypothesis(

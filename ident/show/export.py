@@ -320,7 +320,7 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
             slips = maxwell_slips(p["stiffness"], p["coulomb"], p["exponent"], 1.0)
             _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"motor:{name}": 1.0})
     elif cause.effect == "cogging":
-        _add_passive(spec, index, name, cogging=[-p["amplitude"], p["periods_per_rev"], p.get("phase", 0.0)])
+        _add_passive(spec, index, name, cogging=[p["amplitude"], p["periods_per_rev"], p.get("phase", 0.0)])
     elif cause.effect == "torque_constant":
         drive.gear = [drive.gear[0] * p["scale"], 0, 0, 0, 0, 0]
     elif cause.effect == "torque_delay":

@@ -83,7 +83,7 @@ class TorqueSaturation:
 
 @dataclass(frozen=True)
 class Cogging:
-    """``amplitude sin(periods_per_rev q + phase)`` against the motor, q in rad on the link side."""
+    """``amplitude sin(periods_per_rev q + phase)`` that drives the motor, q in rad on the link side."""
 
     place: str
     amplitude: float
@@ -94,5 +94,5 @@ class Cogging:
     def torque(self, run: Run) -> Callable[[State], Torque]:
         j = run.joint(self.place)
         return lambda x: Torque(
-            j, -self.amplitude * np.sin(self.periods_per_rev * x.q[:, j] + self.phase)
+            j, self.amplitude * np.sin(self.periods_per_rev * x.q[:, j] + self.phase)
         )
