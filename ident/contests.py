@@ -80,7 +80,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         return h.key not in there or (h.key == winner.key and loaded[0] != loaded[1])
 
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
-    rivals = [e for _, e in best_named([(e.hypothesis, e) for e in rivals], FINALISTS)]
+    rivals = [e for _, e in best_named([(e.hypothesis, e) for e in rivals], FINALISTS, FINALISTS)]
     rivals += [e for e in alike(found, winner) if other(e.hypothesis) and all(e.hypothesis is not x.hypothesis for x in rivals)]
     rivals += [*as_load(current, own, others), *elsewhere(problem, current, own, others)]
     rivals += wider(problem, current, own) if nearly_settled(current) else []

@@ -18,7 +18,7 @@ from ident.costs import weighted_cost
 from ident.evidence import explained, last_is_pointless
 from ident.extended import Prediction
 from ident.hypotheses import Hypothesis
-from ident.model import Model, has_loop, has_rough_law, is_along_record
+from ident.model import Model, has_loop, is_along_record
 from ident.parallel import Workers
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
 from ident.refits import FAINT, FINALISTS, FIRST_STEPS, either_turn, extended_by, left_by, refit, reweighted, turned
@@ -100,13 +100,13 @@ def explore_softly(
     stage, level = soften(problem, current)
     found, scores = explore(problem, stage, hypotheses, 0.0, ANSWERED, workers, rough=True)
     # Of laws of which nothing is left but a special case, that one goes on.
-    last = best_named([(h, r) for h, r in found if not last_is_pointless(r)], FINALISTS)
+    last = best_named([(h, r) for h, r in found if not last_is_pointless(r)], FINALISTS, FINALISTS)
     softly = {h.key: explained(stage, r, noise=0.0) for h, r in last}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
     ways = [(h, r, (*ladder, sharp)) for h, r in last]
-    ways += [(h, r, (sharp,)) for h, r in best_named(direct, FINALISTS)]
+    ways += [(h, r, (sharp,)) for h, r in best_named(direct, FINALISTS, FINALISTS)]
 
     def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> Fit | None:
         _, result, steps = way
@@ -199,12 +199,11 @@ def explore(
     found = begun(chosen)
     if not workers.late:
         found += begun(other_bodies(found, chosen, scores))
-    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law along the
-    # record, under which a record may be in another steady motion, or that is solved as a loop, leaves that much itself.
+    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law that is solved as a
+    # loop or along the record leaves that much itself.
     seen = np.setdiff1d(np.arange(len(stage.counts)), list(quiet))
     allowed = (DETECTION_EXCESS - 1.0) * np.sum(stage.counts[seen])
-    rough_law = has_rough_law(stage.model) or any(map(has_loop, stage.model.effects))
-    unclear = stage.chi2_per_dof <= FAINT and not rough_law and left_by(found, seen) > allowed
+    unclear = stage.chi2_per_dof <= FAINT and not any(map(has_loop, stage.model.effects)) and left_by(found, seen) > allowed
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
@@ -248,8 +247,8 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
     """
     ranked = sorted(found, key=lambda x: x[1].cost)
     limit = HOPELESS_RATIO * max(ranked[0][1].cost - ranked[0][1].count, 0.0) if ranked else 0.0
-    near = [(h, r) for h, r in best_named(ranked, HOPEFUL) if r.cost - r.count < limit and not r.converged]
-    kept = best_named(ranked, FINALISTS)
+    near = [(h, r) for h, r in best_named(ranked, HOPEFUL, HOPEFUL) if r.cost - r.count < limit and not r.converged]
+    kept = best_named(ranked, FINALISTS, FINALISTS)
     kept += [(h, r) for h, r in near if all(h is not k for k, _ in kept)]
     first = [(h, r) for h, r in found[:1] if not r.converged and all(h is not k for k, _ in kept)]
     kept += first
@@ -257,30 +256,27 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
     return [*kept, *((h, r) for h, r in ranked if h.key in special and all(h is not k for k, _ in kept))]
 
 
-def best_named(ranked: Sequence[tuple[Hypothesis, T]], count: int) -> list[tuple[Hypothesis, T]]:
-    """The first ``count`` of the catalogue, of a ranking, and of the decoys before the last of them: these take no place of a named one."""
+def best_named(ranked: Sequence[tuple[Hypothesis, T]], count: int, decoys: int) -> list[tuple[Hypothesis, T]]:
+    """The first ``count`` of the catalogue, of a ranking, and the first ``decoys`` before the last of them: these take no place of a named one."""
     decoy = np.array([h.decoy for h, _ in ranked], bool)
     before = np.cumsum(~decoy) - ~decoy  # named ones
-    kept = (before < count) & (~decoy | (np.cumsum(decoy) <= count))
+    kept = (before < count) & (~decoy | (np.cumsum(decoy) <= decoys))
     return [pair for pair, k in zip(ranked, kept, strict=True) if k]
 
 
 def choose(scores: Sequence[Score]) -> list[Score]:
-    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times. Decoys take no place of a named one.
+    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
 
     A linear step hardly tells where a hinge is: if one is worth a refit, so are those before and after other joints
     that come near it.
     """
-    out: list[Score] = []
+    worth: list[tuple[Hypothesis, Score]] = []
     top = scores[0].gain if scores else 0.0
     for score in scores:
-        same = sum(s.hypothesis.effect == score.hypothesis.effect for s in out)
-        decoys = sum(s.hypothesis.decoy for s in out)
-        if score.start is None or same == PER_EFFECT or score.gain < KEEP_RATIO * top or (score.hypothesis.decoy and decoys == DECOYS):
-            continue
-        out.append(score)
-        if len(out) - decoys == REFITS and not score.hypothesis.decoy:
-            break
+        same = sum(h.effect == score.hypothesis.effect for h, _ in worth)
+        if score.start is not None and same < PER_EFFECT and score.gain >= KEEP_RATIO * top:
+            worth.append((score.hypothesis, score))
+    out = [score for _, score in best_named(worth, REFITS, DECOYS)]
     hinges = [s for s in out if "hinge" in s.hypothesis.options]
     taken = {_side(s) for s in hinges}
     for s in scores:

@@ -809,10 +809,10 @@ def test_decoys_take_no_place_of_a_named_one(named):
     scores = [SimpleNamespace(hypothesis=h, gain=1.0 - 0.01 * i, start=np.ones(3)) for i, h in enumerate(laws)]
     chosen = [s.hypothesis for s in choose(scores)]
     assert chosen == laws[:DECOYS] + laws[6 : 6 + REFITS]
-    kept = best_named([(h, i) for i, h in enumerate(chosen)], 3)
+    kept = best_named([(h, i) for i, h in enumerate(chosen)], 3, 3)
     assert kept == [*((h, i) for i, h in enumerate(laws[:3])), *((h, DECOYS + i) for i, h in enumerate(laws[6:9]))]
-    behind = best_named([(h, None) for h in (*laws[6:9], laws[0])], 3)
-    assert [h for h, _ in behind] == laws[6:9] and best_named([], 3) == []
+    behind = best_named([(h, None) for h in (*laws[6:9], laws[0])], 3, 3)
+    assert [h for h, _ in behind] == laws[6:9] and best_named([], 3, 3) == []
 
 
 def test_a_cause_meets_those_that_are_hard_to_tell_from_it_though_its_round_has_not_tried_them(named):

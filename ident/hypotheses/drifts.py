@@ -1,10 +1,10 @@
-"""What changes while the machine warms up beside its friction."""
+"""How a machine changes while it warms up, and a decoy that does so beside its friction."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ident.hypotheses.drive import SCALE
+from ident.hypotheses.drive import SCALE, in_time, over_gain, scale_of
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from ident.motion import Motion
 
@@ -24,6 +24,11 @@ def time_constants(scale: SignalScale) -> list[tuple[float, ...]]:
     return [(share * scale.duration,) for share in BEGUN] if scale.duration > 0 else []
 
 
+def first_change(change: float) -> float:
+    """A relative change as a linear step asks for it, within what a fit may begin from."""
+    return float(np.clip(change, -0.9, 3.0))
+
+
 def torque_drift(joint: int, place: str) -> Hypothesis:
     """Decoy: a torque constant that changes with time, as that of a warm magnet does.
 
@@ -32,14 +37,13 @@ def torque_drift(joint: int, place: str) -> Hypothesis:
 
     def asked(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
         scale, change, tau = p
-        more = 1.0 / (scale * (1.0 + change * warmth(motion, tau))) - 1.0
-        return U + motion.lines(more * motion.group.to_time(U[..., None])[..., 0])
+        return over_gain(U, scale * (1.0 + change * warmth(motion, tau)), motion)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        u = motion.group.to_time(motion.solution.U[..., j : j + 1])[..., 0]
+        u = in_time(motion.solution.U[..., j], motion)
 
         def start(c):
-            return np.array([1.0 / (1.0 + np.clip(c[0], -0.8, 4.0)), np.clip(c[1], -0.9, 3.0), shape[0]])
+            return np.array([scale_of(c[0]), first_change(c[1]), shape[0]])
 
         return Screen((u, -warmth(motion, shape[0]) * u), start, shape)
 
@@ -56,7 +60,7 @@ def torque_drift(joint: int, place: str) -> Hypothesis:
         variable="time",
         options={
             "absorbs": "torque_constant",
-            "absorb": lambda p, weights, old: np.array([old[0] / (1.0 + np.clip(weights[0], -0.8, 4.0)), *p[1:]]),
+            "absorb": lambda p, weights, old: np.array([old[0] * scale_of(weights[0]), *p[1:]]),
             "apart": "time_constant",
             "plain": lambda p: p[2] < PLAIN * TIME_CONSTANT.lower,
             "special": lambda p: np.array([p[0] * (1.0 + p[1])]),

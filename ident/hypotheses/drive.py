@@ -16,11 +16,26 @@ MOST_RIPPLE = 0.5  # of the torque of a motor, that ripples with it
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
 
+def scale_of(weight: float) -> float:
+    """Delivered torque over the recorded one, where a linear step asks for ``weight`` of the torque more."""
+    return 1.0 / (1.0 + np.clip(weight, -0.8, 4.0))
+
+
+def over_gain(U: np.ndarray, gain: np.ndarray, motion: Motion) -> np.ndarray:
+    """Recorded torque (..., L) of which a motor delivers ``U`` (..., L), by a gain (S, T) that changes along the record."""
+    return U + motion.lines((1.0 / gain - 1.0) * in_time(U, motion))
+
+
+def in_time(U: np.ndarray, motion: Motion) -> np.ndarray:
+    """A spectrum (..., L) of one joint on the grid of time, (..., T)."""
+    return motion.group.to_time(U[..., None])[..., 0]
+
+
 def torque_constant(joint: int, place: str) -> Hypothesis:
     """Delivered torque is ``scale`` times the recorded one."""
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        return Screen((motion.solution.U[..., j],), lambda c: np.array([1.0 / (1.0 + np.clip(c[0], -0.8, 4.0))]))
+        return Screen((motion.solution.U[..., j],), lambda c: np.array([scale_of(c[0])]))
 
     return Hypothesis(
         "torque_constant",
@@ -165,14 +180,13 @@ def torque_ripple(joint: int, place: str) -> Hypothesis:
 
     def asked(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
         sine, n, cosine = p
-        if not np.any(U):  # nothing ripples by nothing
+        if not np.any(U):  # asked before the motion is known, of which nothing ripples
             return U
         q = n * motion.q(j)
-        more = 1.0 / (1.0 + sine * np.sin(q) + cosine * np.cos(q)) - 1.0
-        return U + motion.lines(more * motion.group.to_time(U[..., None])[..., 0])
+        return over_gain(U, 1.0 + sine * np.sin(q) + cosine * np.cos(q), motion)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        q, u = shape[0] * motion.q(j), motion.group.to_time(motion.solution.U[..., j : j + 1])[..., 0]
+        q, u = shape[0] * motion.q(j), in_time(motion.solution.U[..., j], motion)
         return Screen((-np.sin(q) * u, -np.cos(q) * u), lambda c: np.array([c[0], shape[0], c[1]]), shape)
 
     part = Parameter("sine", "1", -MOST_RIPPLE, MOST_RIPPLE, spread=0.05)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.group import Group
-from ident.hypotheses.drifts import CHANGE, TIME_CONSTANT, time_constants, warmth
+from ident.hypotheses.drifts import CHANGE, TIME_CONSTANT, first_change, time_constants, warmth
 from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.kernels import smooth_sign
 from ident.hypotheses.yielding import DAHL, bristle
@@ -290,14 +290,14 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
         def start(c):
             coulomb = max(c[1], 1e-6)
             change = c[2] / coulomb if c[1] > 1e-6 else c[0]
-            change = float(np.clip(change, -0.9, 3.0)) or 0.1
+            change = first_change(change) or 0.1
             return np.array([change, shape[0], coulomb, smoothing])
 
         return Screen((warm * drag, s, warm * s), start, shape)
 
     def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
         coulomb = max(old[0] + weights[1], 0.1 * old[0])
-        return np.array([np.clip(weights[2] / coulomb, -0.9, 3.0), p[1], coulomb, old[2]])
+        return np.array([first_change(weights[2] / coulomb), p[1], coulomb, old[2]])
 
     return Hypothesis(
         "friction_drift",
