@@ -66,8 +66,9 @@ def jacobian(
         return columns
     # Differences of laws at the motors have it in them.
     dense, at_motors = columns.dense(), np.array([e.hypothesis.channel == "motor" for e in model.effects for _ in e.p])
-    passed = np.concatenate([np.ones(m + 1, bool), ~at_motors])
-    dense[..., passed] = as_free(dense[..., passed], still, group)
+    passed = np.flatnonzero(np.concatenate([np.ones(m + 1, bool), ~at_motors]))
+    for j in np.flatnonzero(np.any(still, axis=(0, 1))):
+        dense[:, :, j, passed] = as_free(dense[:, :, j, passed], still[..., j], group)
     return columns.made_whole(dense)
 
 

@@ -145,7 +145,8 @@ def link_motion(
     drive = plane.C * (Q @ par.coupling.T) + torques.spring
     load = -W - torques.link
     load[..., structure.driven] += drive
-    return np.matmul(plane.A_inv, load[..., None])[..., 0]
+    # A line at a time, all records at once.
+    return np.matmul(load.swapaxes(0, 1), plane.A_inv.swapaxes(1, 2)).swapaxes(0, 1)
 
 
 def geometric_remainder(structure: Structure, plane: Plane, group: Group, Q_a: np.ndarray) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -23,7 +24,8 @@ class Torques:
 class Solution:
     """A prediction and its parts; spectra of (S, L, .).
 
-    ``Q_a`` holds all coordinates of the links, ``Q_driven`` those that the joints drive, in their order.
+    ``Q_a`` holds all coordinates of the links, ``Q_driven`` those that the joints drive, in their order. ``signals``: in time,
+    what was made of any of these but ``U`` already.
     """
 
     Q: np.ndarray
@@ -34,11 +36,12 @@ class Solution:
     U: np.ndarray
     W: np.ndarray
     torques: Torques
+    signals: dict[Hashable, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Time signals of a solution, made where they are asked for; each (S, T) on the group's grid.
+    """Time signals of a solution, made where they are first asked for; each (S, T) on the group's grid, not to be written to.
 
     ``beside``: spectra (S, L, n) of what else acts at the motors, N m. ``error``: the same, rad, by which the position
     that laws see is taken off. ``delivered``: the same, N m, what the motors deliver by the record; the record itself where None.
@@ -52,15 +55,25 @@ class Motion:
     error: np.ndarray | float = 0.0
     delivered: np.ndarray | None = None
     told: frozenset[int] = frozenset()
+    asked_of: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def kept(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """A signal (S, T) of the solution, which is made once: laws ask for it again with every step of their parameters."""
+        if self.solution is None or isinstance(self.error, np.ndarray):
+            return make()
+        signals = self.solution.signals
+        if key not in signals:
+            signals[key] = make()
+        return signals[key]
 
     def q(self, joint: int) -> np.ndarray:
         """Motor position without lines of noise alone, rad."""
-        return self._shown(joint, 0)
+        return self.kept(("q", joint), lambda: self._shown(joint, 0))
 
     def v(self, joint: int) -> np.ndarray:
         """Motor velocity without lines of noise alone, rad/s."""
-        fast, v = self.group.fast_velocity, self._shown(joint, 1)
-        return v if fast is None else v + fast[..., joint]
+        fast = 0.0 if self.group.fast_velocity is None else self.group.fast_velocity[..., joint]
+        return self.kept(("v", joint), lambda: self._shown(joint, 1) + fast)
 
     def acceleration(self, joint: int) -> np.ndarray:
         """Motor acceleration, rad/s2."""
@@ -68,23 +81,23 @@ class Motion:
 
     def delta(self, joint: int) -> np.ndarray:
         """Deflection of the gear, rad."""
-        return self._time(self.solution.delta, joint)
+        return self.kept(("delta", joint), lambda: self._time(self.solution.delta, joint))
 
     def delta_rate(self, joint: int) -> np.ndarray:
         """Its rate, rad/s."""
-        return self._time(self.solution.delta, joint, 1)
+        return self.kept(("delta_rate", joint), lambda: self._time(self.solution.delta, joint, 1))
 
     def tau_s(self, joint: int) -> np.ndarray:
         """Torque that the gear carries, N m."""
-        return self._time(self.solution.tau_s, joint)
+        return self.kept(("tau_s", joint), lambda: self._time(self.solution.tau_s, joint))
 
     def q_link(self, joint: int) -> np.ndarray:
         """Position of the link behind the gear, rad."""
-        return self._time(self.solution.Q_driven, joint)
+        return self.kept(("q_link", joint), lambda: self._time(self.solution.Q_driven, joint))
 
     def v_link(self, joint: int) -> np.ndarray:
         """Its velocity, rad/s."""
-        return self._time(self.solution.Q_driven, joint, 1)
+        return self.kept(("v_link", joint), lambda: self._time(self.solution.Q_driven, joint, 1))
 
     def torque(self, joint: int) -> np.ndarray:
         """Recorded motor torque without lines of noise alone, N m."""
@@ -97,6 +110,11 @@ class Motion:
 
     def asked(self, joint: int) -> np.ndarray:
         """Torque that the record leaves to a friction of the motor, N m."""
+        if joint not in self.asked_of:
+            self.asked_of[joint] = self._asked(joint)
+        return self.asked_of[joint]
+
+    def _asked(self, joint: int) -> np.ndarray:
         s, x = 1j * self.group.omega, self.solution
         linear = (s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) * x.Q[..., joint]
         carried = x.tau_s @ self.par.coupling[:, joint]

@@ -63,13 +63,14 @@ def as_held(S: np.ndarray, share: np.ndarray | None) -> np.ndarray:
 
 
 def as_free(columns: np.ndarray, still: np.ndarray, group: Group) -> np.ndarray:
-    """Derivatives (S, K, n + M, p) of compared outputs by coordinates, of torques as far as motors are free.
+    """Derivatives (S, K, p) of the torque of a motor by coordinates, as far as it is free.
 
     Args:
-        still: (S, T, n) of ``held``.
+        still: (S, T) of ``held``, of that motor.
     """
-    out = columns.copy()
-    for j in np.flatnonzero(np.any(still, axis=(0, 1))):
-        along = np.where(still[..., j, None], 0.0, group.to_time(columns[:, :, j]))
-        out[:, :, j] = group.to_lines(along)[:, : columns.shape[1]]
+    felt = np.any(columns, axis=(0, 1))
+    along = group.to_time(columns[..., felt])
+    along[still] = 0.0
+    out = np.zeros_like(columns)
+    out[..., felt] = group.to_lines(along)[:, : columns.shape[1]]
     return out

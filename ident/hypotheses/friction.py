@@ -42,6 +42,11 @@ def direction(v: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
     return smooth_sign(np.ascontiguousarray(v), float(smoothing))
 
 
+def _turned(motion: Motion, j: int, smoothing: float) -> np.ndarray:
+    """``direction`` of a motor's motion (S, T)."""
+    return motion.kept(("direction", j, smoothing), lambda: direction(motion.v(j), smoothing))
+
+
 def dry(
     motion: Motion,
     j: int,
@@ -58,7 +63,7 @@ def dry(
         back: the size in the other direction; the same where None.
     """
     back = size if back is None else back
-    s = direction(motion.v(j), smoothing)
+    s = _turned(motion, j, smoothing)
     moving = np.where(s > 0, size, back) * s
     rest = resting(motion, j, smoothing)
     if rest is None:
@@ -80,10 +85,10 @@ def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
     """Dry friction (S, T) over its size, of which the rest itself says one."""
     rest = resting(motion, j, smoothing)
     if rest is None:
-        return direction(motion.v(j), smoothing)
+        return _turned(motion, j, smoothing)
     size = np.quantile(np.abs(motion.asked(j)[rest]), REST_QUANTILE)
     if size < SEEN * motion.asked_noise(j):
-        return direction(motion.v(j), smoothing)
+        return _turned(motion, j, smoothing)
     return dry(motion, j, smoothing, size) / max(size, LEAST_TORQUE)
 
 
