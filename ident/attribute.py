@@ -84,12 +84,14 @@ def attribute(
     *,
     max_causes: int = 4,
     hypotheses: Sequence[Hypothesis] | None = None,
+    known: Attribution | None = None,
     workers: Workers = Workers(),
 ) -> Attribution:
     """Find the causes of what the baseline does not explain.
 
     Args:
         max_causes: rounds at most; an effect found at several joints at once is one of them.
+        known: causes of the same records that were found beside more noise, from which the search goes on.
         workers: where candidates are fitted.
     """
     if hypotheses is None:
@@ -99,7 +101,11 @@ def attribute(
     p_value = p_detected = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
     clear = p_value < level and (baseline.chi2_per_dof > DETECTION_EXCESS or np.any(loud(baseline)))
-    current, rounds, unknown, count, looped = baseline, [], False, 0, None
+    current, rounds, unknown, looped = baseline, [], False, None
+    if known is not None and known.final.model.effects:
+        current, rounds = carried_on(problem, known, workers)
+        hypotheses = untaken(hypotheses, current.model.effects)
+    count = len({r.candidates[0].hypothesis.effect for r in rounds})
     while count < max_causes and not workers.late:
         if settled(current) and looped is not current:
             # Along the record noise is taken large, and hides other causes.
@@ -143,11 +149,7 @@ def attribute(
             # What is sought next would make up for a cause that was named wrongly as long as this one was missing.
             current, earlier = weighed_again(problem, current, rounds[:-1], workers)
             rounds = [*earlier, rounds[-1]]
-        taken |= {e.hypothesis.key for e in current.model.effects}
-        # A special case of what is there already would only share its size with it.
-        taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in current.model.effects}
-        loaded = any(effect == "payload" for effect, _ in taken)
-        hypotheses = tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
+        hypotheses = tuple(h for h in untaken(hypotheses, current.model.effects) if h.key not in taken)
     if looped is not current and not workers.late:
         current = as_loops(problem, current, workers)
     current = without_shadows(problem, current, rounds, workers)
@@ -161,6 +163,26 @@ def attribute(
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
     return Attribution(baseline, clear or bool(kept), p_detected if kept else p_value, kept, current, unknown)
+
+
+def carried_on(problem: Problem, known: Attribution, workers: Workers) -> tuple[Fit, list[Round]]:
+    """Causes found beside other noise, fitted and weighed beside that of ``problem``: the model, and a round for each."""
+    current = polish(problem, known.final)
+    there = {e.hypothesis.key for e in current.model.effects}
+    rounds = []
+    for found in known.rounds:
+        if found.candidates[0].hypothesis.key in there:
+            seen = tuple(replace(c, fit=reweighted(problem, c.fit, current.weights)) for c in found.candidates)
+            rounds.append(replace(found, before=reweighted(problem, found.before, current.weights), candidates=seen))
+    return weighed_again(problem, current, rounds, workers)
+
+
+def untaken(hypotheses: Sequence[Hypothesis], effects: Sequence[Effect]) -> tuple[Hypothesis, ...]:
+    """Hypotheses that may be sought beside effects: a special case of what is there already would only share its size with it."""
+    taken = {e.hypothesis.key for e in effects}
+    taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in effects}
+    loaded = any(effect == "payload" for effect, _ in taken)
+    return tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))
 
 
 def less_errors_of_laws(current: Fit, told: np.ndarray) -> Fit:

@@ -9,6 +9,7 @@ from ident.baseline import DETECTION_EXCESS
 from ident.evidence import Candidate, errors_by_joint, weigh
 from ident.hypotheses import Hypothesis, catalogue
 from ident.hypotheses.bodies import payload, payload_like
+from ident.hypotheses.hypothesis import RIPPLE
 from ident.model import Effect
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
@@ -29,7 +30,6 @@ from ident.screening import screen, signal_scale
 from ident.search import HOPELESS_RATIO, best_named
 from ident.torque_fit import Fit
 
-RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 SAME_PERIOD = 0.01  # relative, of two ripples
 REMATCH = 0.002  # probability from which a rival is weighed against a cause again at the end
 ALIKE = (  # pairs that are hard to tell apart beside a cause that is missing
@@ -155,15 +155,16 @@ def as_load(current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]
 
 
 def elsewhere(problem: Problem, current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:
-    """A ripple as it is screened beside all others: found beside causes that were missing its wave number may be another's."""
-    if RIPPLE not in [q.name for q in own.hypothesis.parameters]:
+    """A ripple as it is screened beside all others: found beside causes that were missing its wave number may be another one's."""
+    if not own.hypothesis.repeats:
         return []
     without = refit(problem, replace(current.model, effects=tuple(others)), current.weights, current.remainders, FIRST_STEPS)
     if without is None:
         return []
     preds = predictions(problem, without.model, without.remainders)
     scores = screen(problem, without, preds, [own.hypothesis])
-    found = [Effect(own.hypothesis, clip_to_bounds(own.hypothesis, s.start)) for s in scores if s.start is not None]
+    waves = [x for s in scores for x in (s, *s.near)]
+    found = [Effect(own.hypothesis, clip_to_bounds(own.hypothesis, s.start)) for s in waves if s.start is not None]
     return [e for e in found if abs(e.value(RIPPLE) / own.value(RIPPLE) - 1.0) > SAME_PERIOD]
 
 

@@ -197,7 +197,7 @@ def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
 
 
 def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
-    """Causes of what the baseline leaves, sought again where beside them the noise turns out to be far less than was guessed."""
+    """Causes of what the baseline leaves, and more of them where beside these the noise turns out to be far less than was guessed."""
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     try:
         other, first = under_noise_beside_causes(dataset, setup, result.final)
@@ -206,7 +206,7 @@ def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, worke
     if other is setup or workers.late:
         return setup, baseline, result
     workers.say("less noise")
-    return other, first, attribute(other.problem, first, max_causes=max_causes, workers=workers)
+    return other, first, attribute(other.problem, first, max_causes=max_causes, known=result, workers=workers)
 
 
 def unresolved(result: Attribution) -> bool:

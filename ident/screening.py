@@ -24,6 +24,9 @@ from ident.problem import Problem, output_error
 from ident.torque_fit import RIDGE, Fit
 from ident.torque_fit import inverse as steadied_inverse
 
+MOST_WAVES = 2  # of a ripple, beside the best
+NEAR_WAVE = 0.9  # of the gain of the best
+SAME_WAVE = 0.02  # relative, of two
 SHIFT = 1e-4  # rad or m, of a position along which a motion is predicted once more
 
 
@@ -32,7 +35,8 @@ class Score:
     """Best unit response of a hypothesis: fall of the cost, its degrees of freedom, a start.
 
     ``step`` (p,) is what the coordinates that are fitted already do in the same linear step, as a gear does that has
-    taken the place of a spring beside it; None where it is not known.
+    taken the place of a spring beside it; None where it is not known. ``near``: scores at other wave numbers of a ripple, best
+    first, that come near the best: a motion of a few turns hardly tells them, and no step of a fit leads from one to another.
     """
 
     hypothesis: Hypothesis
@@ -42,6 +46,7 @@ class Score:
     weights: np.ndarray
     shape: tuple[float, ...]
     step: np.ndarray | None = None
+    near: tuple[Score, ...] = ()
 
 
 def signal_scale(
@@ -196,8 +201,18 @@ def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequen
         if scores:
             # A resonance that is taken away says nothing of one that is missing elsewhere.
             hinge = "hinge" in h.options
-            best.append(max(scores, key=lambda s: (not hinge or s.start is not None, s.gain)))
+            first, *others = sorted(scores, key=lambda s: (hinge and s.start is None, -s.gain))
+            best.append(replace(first, near=other_waves(first, others)) if h.repeats else first)
     return best
+
+
+def other_waves(best: Score, others: Sequence[Score]) -> tuple[Score, ...]:
+    """Scores of a ripple, best first, at wave numbers that none before has, and that come near the best."""
+    kept = [best]
+    for s in others:
+        if s.start is not None and s.gain >= NEAR_WAVE * best.gain and all(abs(s.shape[0] / k.shape[0] - 1.0) > SAME_WAVE for k in kept):
+            kept.append(s)
+    return tuple(kept[1 : 1 + MOST_WAVES])
 
 
 def _score(

@@ -177,6 +177,10 @@ def explore(
     answered = bool(scores) and scores[0].gain >= least * excess
 
     def started(score: Score) -> Fit | None:
+        fits = [started_at(s) for s in (score, *score.near)]
+        return min((r for r in fits if r is not None), key=lambda r: r.cost, default=None)
+
+    def started_at(score: Score) -> Fit | None:
         # A start that has lost the data was a step that is not linear, and a gear that hits one end of its dead band after
         # the other takes minutes to fit. A hinge that stands anywhere begins off them, and what answers best is tried from anywhere.
         anywhere = "hinge" in score.hypothesis.options or score.gain >= scores[0].gain

@@ -9,12 +9,13 @@ import numpy as np
 
 from ident.attribute import Attribution
 from ident.baseline import DETECTION_EXCESS, implausible
-from ident.contests import RIPPLE, SAME_PERIOD
+from ident.contests import SAME_PERIOD
 from ident.costs import fair_costs, weighted_cost
 from ident.extended import Prediction
 from ident.faint import SHADOW
 from ident.group import Group
 from ident.hypotheses import Hypothesis
+from ident.hypotheses.hypothesis import RIPPLE
 from ident.model import Effect
 from ident.problem import NOT_COMPUTED, Problem, data_counts, predictions
 from ident.pruning import UNTOLD
@@ -138,8 +139,7 @@ def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect
 
     Elsewhere along the path the joint runs so fast that the ripple lies beyond the band.
     """
-    names = [q.name for q in effect.hypothesis.parameters]
-    if not problem.motions_alone or RIPPLE not in names:
+    if not problem.motions_alone or not effect.hypothesis.repeats:
         return False
     wave_number, path = effect.value(RIPPLE), 0.0
     for group, pred in zip(problem.groups, predictions, strict=True):
@@ -180,7 +180,7 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
 def overtone(found: Round, other: Round) -> bool:
     """Whether the ripple of a cause has a multiple of the periods of another one: no ripple of a machine is a sine."""
     best = [x.candidates[0] for x in (found, other)]
-    if not all(RIPPLE in [q.name for q in c.hypothesis.parameters] for c in best):
+    if not all(c.hypothesis.repeats for c in best):
         return False
     waves = [e.value(RIPPLE) for c in best for e in c.fit.model.effects if e.hypothesis.key == c.hypothesis.key]
     ratio = waves[0] / waves[1]

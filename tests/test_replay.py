@@ -117,7 +117,7 @@ MORE_ARM = [
     make_effect("backlash", "shoulder_lift_joint", gap=3e-4),  # which the links' weight closes on one side
     make_effect("gravity_spring", "elbow_joint", stiffness=40.0, rest_angle=0.3),
     make_effect("hysteresis", "elbow_joint", stiffness=8e3, yield_torque=4.0),
-    make_effect("torque_saturation", "shoulder_lift_joint", limit=100.0),
+    make_effect("torque_saturation", "shoulder_lift_joint", limit=95.0),  # which both postures reach
 ]
 
 

@@ -203,9 +203,11 @@ def test_inertias_that_do_worse_than_the_description_are_left_at_once(moved, mon
     assert asked == [worse] * sought
 
 
-@pytest.mark.slow
 def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
-    """Freed inertias would hide it: they are asked only where the catalogue leaves much."""
+    """Freed inertias would hide it: they are asked only where the catalogue leaves much.
+
+    Beside it the noise is far less than was guessed: sought anew beside that noise it would not be found.
+    """
     hidden = parse_effect("payload@flange:mass=4,com_x=0.02,com_y=0.03,com_z=0.1", ur10)
     drives = draw_drives(np.random.default_rng(2), ur10)
     parts = [run_experiment(small_plan(ur10, seed, points=1, trajectory=True), [hidden], seed=seed, drives=drives) for seed in (21, 22)]

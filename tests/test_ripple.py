@@ -11,6 +11,7 @@ from ident.diagnosis import diagnose
 from ident.hypotheses import catalogue
 from ident.hypotheses.ripple import ripple
 from ident.problem import predictions
+from ident.screening import Score, other_waves
 from sim import parse_effect, run_experiment
 from sim.effects.effect import Torque
 from sim.effects.transmission import carried
@@ -79,6 +80,19 @@ def test_a_ripple_that_grows_with_the_torque_is_asked_for_in_advance(identified)
     unit = sum(w * motion.lines(x) for w, x in zip(p[[0, 2]], made.signals, strict=True))
     assert np.linalg.norm((told(1e-4) - U) / 1e-4 - unit) < 1e-3 * np.linalg.norm(unit)
     assert made.start(np.array([0.03, 0.02])) == pytest.approx(p)
+
+
+def test_other_wave_numbers_that_explain_nearly_as_much_are_kept(identified):
+    _, setup, _ = identified
+    h = next(h for h in catalogue(setup.problem.structure) if h.key == ("cogging", "elbow_joint"))
+
+    def score(wave, gain, start=np.zeros(5)):
+        return Score(h, gain, 2, start, np.ones(2), (wave,))
+
+    best, near, nearer, far = score(300.0, 100.0), score(200.0, 92.0), score(202.0, 91.0), score(50.0, 80.0)
+    unstarted, third, fourth = score(150.0, 99.0, None), score(400.0, 91.0), score(800.0, 90.5)
+    assert other_waves(best, [unstarted, near, nearer, third, fourth, far]) == (near, third)
+    assert other_waves(best, [far, score(302.0, 99.0)]) == ()
 
 
 @pytest.mark.parametrize("name", ["cogging", pytest.param("transmission_error", marks=pytest.mark.slow)])

@@ -79,6 +79,7 @@ class Parameter:
         return max(abs(value), 1e-300)
 
 
+RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 START = Parameter("start", "1", -1.0, 1.0, nuisance=True, step=0.02, center=0.0, spread=0.5, null=0.0, at_start=True)
 EXPONENT = Parameter("exponent", "1", 0.5, SLIP, True, nuisance=True, step=0.05, center=1.0, spread=1.5, reported=True)
 
@@ -162,6 +163,11 @@ class Hypothesis:
     def coordinate(self, parameter: str) -> str:
         """Name of one of its parameters among all coordinates of a fit."""
         return f"{self.effect}@{self.place}:{parameter}"
+
+    @property
+    def repeats(self) -> bool:
+        """Whether it is a ripple, with a wave number of its own."""
+        return any(q.name == RIPPLE for q in self.parameters)
 
     @property
     def gear_law(self) -> bool:
