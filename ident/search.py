@@ -32,6 +32,7 @@ CLEAR_ANSWER = 0.5  # share of the excess that a linear step must explain where 
 STRONG = 30.0  # chi2 per degree of freedom above which causes are sought under softened weights
 ANSWERED = 0.2  # share of the excess that the best may leave after the first steps where those are enough
 NEAR = 1.1  # excess over that of the best, up to which candidates are compared once more
+HARDLY = 0.02  # share of the excess that the best must explain after the first steps for any to be fitted further
 HOPEFUL = 5  # candidates fitted further after the first steps
 HOPELESS_RATIO = 4.0  # excess, relative to the best, beyond which a candidate is dropped then
 REFITS = 8  # candidates of the catalogue refitted in a round
@@ -211,7 +212,8 @@ def explore(
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
-    if not (rough and left_by(found) < ANSWERED * excess):
+    hardly = left_by(found) > (1.0 - HARDLY) * excess
+    if not hardly and not (rough and left_by(found) < ANSWERED * excess):
         last = workers.map(finished, [r for _, r in found])
         found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores

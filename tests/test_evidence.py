@@ -1053,6 +1053,24 @@ def test_bounds_say_how_large_a_pure_number_may_be_and_no_other(unit, spread):
     assert q.bounded == (unit == "1")
 
 
+@pytest.mark.parametrize(("left", "fitted"), [(0.99, 1), (0.5, 2)])
+def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no_further(identified, monkeypatch, left, fitted):
+    _, setup, baseline = identified
+    h = next(h for h in catalogue(setup.problem.structure) if h.key == ("torque_delay", "elbow_joint"))
+    loud = replace(baseline, costs=10.0 * baseline.counts)
+    steps = []
+
+    def once(problem, model, weights, remainders, iterations=10, most=np.inf):
+        steps.append(iterations)
+        return replace(loud, model=model, costs=baseline.counts + left * (loud.costs - baseline.counts), converged=False)
+
+    score = Score(h, 1e9, 1, np.array([1e-3]), np.ones(1), ())
+    monkeypatch.setattr("ident.search.screen", lambda *args: [score])
+    monkeypatch.setattr("ident.search.refit", once)
+    found, _ = explore(setup.problem, loud, [h], 0.0, np.inf, Workers())
+    assert [k.key for k, _ in found] == [h.key] and len(steps) == fitted
+
+
 @pytest.mark.parametrize(("left", "joints"), [(1.0, {2}), (2.0, {2, 4})])
 def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(identified, monkeypatch, left, joints):
     """At the joint of the best candidate laws are fitted first; at others only where its own leaves more than noise."""
