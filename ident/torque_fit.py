@@ -194,9 +194,10 @@ def fit(
     if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
-    # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a new one.
+    # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a new one, as
+    # softer gears do along a motion.
     motion = problem.motions_alone
-    anew = (shifts_posture(model) and not motion) or any(moves_geometry(e, motion) for e in model.effects)
+    anew = motion or shifts_posture(model) or any(moves_geometry(e, motion) for e in model.effects)
     moves, drift = moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False

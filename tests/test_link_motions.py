@@ -31,8 +31,8 @@ def motions(robot, seed, hidden, folder):
         replace(p.trajectories[0], name=f"motion-{k}", role=role) for k, (p, role) in enumerate(zip(plans, roles, strict=True))
     )
     drives = draw_drives(np.random.default_rng(seed), robot)
-    data = run_experiment(replace(plans[0], trajectories=moves), hidden, seed=seed, drives=drives, link_encoders=True)
-    return through_files(replace(data, segments=tuple(s for s in data.segments if s.kind == "trajectory")), folder)
+    plan = replace(plans[0], experiments=(), trajectories=moves)
+    return through_files(run_experiment(plan, hidden, seed=seed, drives=drives, link_encoders=True), folder)
 
 
 @pytest.fixture(scope="module")

@@ -210,10 +210,11 @@ def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
     """
     hidden = parse_effect("payload@flange:mass=4,com_x=0.02,com_y=0.03,com_z=0.1", ur10)
     drives = draw_drives(np.random.default_rng(2), ur10)
-    parts = [run_experiment(small_plan(ur10, seed, points=1, trajectory=True), [hidden], seed=seed, drives=drives) for seed in (21, 22)]
-    motions = [s for d in parts for s in d.segments if s.kind == "trajectory"]
+    plans = [replace(small_plan(ur10, seed, points=1, trajectory=True), experiments=()) for seed in (21, 22)]
+    parts = [run_experiment(plan, [hidden], seed=seed, drives=drives) for plan, seed in zip(plans, (21, 22), strict=True)]
     roles = ("identification", "validation")
-    data = replace(parts[0], segments=tuple(replace(s, name=f"m{i}", role=r) for i, (s, r) in enumerate(zip(motions, roles, strict=True))))
+    motions = [replace(d.segments[0], name=f"m{i}", role=r) for i, (d, r) in enumerate(zip(parts, roles, strict=True))]
+    data = replace(parts[0], segments=tuple(motions))
     verdict = diagnose_fully(through_files(data, tmp_path)).verdict
     assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [("payload", "flange")]
     assert not verdict.notes
