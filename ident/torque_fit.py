@@ -196,8 +196,7 @@ def fit(
         prior = prior * max(1.0, cost / count)
     # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a new one, as
     # softer gears do along a motion.
-    motion = problem.motions_alone
-    anew = motion or shifts_posture(model) or any(moves_geometry(e, motion) for e in model.effects)
+    anew = problem.motions_alone or shifts_posture(model) or any(moves_geometry(e, False) for e in model.effects)
     moves, drift = moves_links(model), np.zeros(len(x))
     damping = 1e-3
     converged = False

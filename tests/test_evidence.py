@@ -1071,6 +1071,39 @@ def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no
     assert [k.key for k, _ in found] == [h.key] and len(steps) == fitted
 
 
+def test_a_ripple_is_begun_at_all_wave_numbers_that_explain_nearly_as_much(identified, monkeypatch):
+    """The one that leaves least after the first steps is fitted further, though another explained more in a linear step."""
+    _, setup, baseline = identified
+    h = next(h for h in catalogue(setup.problem.structure) if h.key == ("cogging", "elbow_joint"))
+    loud = replace(baseline, costs=10.0 * baseline.counts)
+
+    def once(problem, model, weights, remainders, iterations=10, most=np.inf):
+        wave = model.effects[-1].value("periods_per_rev")
+        return replace(loud, model=model, costs=(2.0 if wave == 202.0 else 5.0) * baseline.counts, converged=True)
+
+    def score(wave, near=()):
+        return Score(h, 1e9, 2, np.array([0.1, wave, 0.0, 0.0, 0.0]), np.ones(2), (wave,), near=near)
+
+    monkeypatch.setattr("ident.search.screen", lambda *args: [score(303.0, (score(202.0), score(101.0)))])
+    monkeypatch.setattr("ident.search.refit", once)
+    ((_, found),), _ = explore(setup.problem, loud, [h], 0.0, np.inf, Workers())
+    assert found.model.effects[-1].value("periods_per_rev") == 202.0
+
+
+def test_signals_of_a_motion_are_made_once_but_for_one_whose_position_is_taken_off(identified):
+    """Of the other the noise of laws is told: with the signals of the motion as it is there would be none."""
+    _, setup, result = identified
+    group, pred = setup.problem.groups[0], predictions(setup.problem, result.model, result.remainders)[0]
+    motion = pred.motion(group)
+    assert pred.motion(group).v(2) is motion.v(2) and motion.q(2) is not motion.q(3)
+    off = np.zeros_like(group.Q)
+    off[:, 1, 2] = 0.1
+    moved = replace(motion, error=off)
+    assert np.allclose(moved.q(2) - motion.q(2), group.to_time(off)[..., 2])
+    less = replace(motion, beside=off)
+    assert less.v(2) is motion.v(2) and not np.allclose(less.asked(2), motion.asked(2))
+
+
 @pytest.mark.parametrize(("left", "joints"), [(1.0, {2}), (2.0, {2, 4})])
 def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(identified, monkeypatch, left, joints):
     """At the joint of the best candidate laws are fitted first; at others only where its own leaves more than noise."""
