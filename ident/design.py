@@ -26,6 +26,7 @@ from ident.candidates import Candidates, draw_candidates
 from ident.chain import Structure, build_structure
 from ident.graybox import Parameters, parameter_names
 from ident.information import conditions, information, linearised, motor_loads
+from ident.parallel import one_thread_each
 from ident.plan import Plan, make_plan
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
@@ -95,6 +96,7 @@ class Design:
         return float(np.exp(np.median(self.random_loss) - self.loss))
 
 
+@one_thread_each
 def design_experiment(
     robot: Robot,
     *,

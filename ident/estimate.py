@@ -24,6 +24,7 @@ import scipy.linalg
 from ident.chain import Structure
 from ident.frf_basis import FRF
 from ident.graybox import Linearisation, Parameters, equilibrium, linearise, parameter_names, sampled_frf
+from ident.parallel import one_thread_each
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("nls", "wnls", "lls", "wlls")
@@ -69,6 +70,7 @@ class Estimate:
         return self.covariance / np.outer(d, d)
 
 
+@one_thread_each
 def fit_frf(
     structure: Structure,
     frf: FRF,

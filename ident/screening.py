@@ -17,7 +17,7 @@ from ident.derivatives import as_real, jacobian
 from ident.extended import Prediction, predict
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.motion import Motion
-from ident.parallel import map_threads
+from ident.parallel import map_threads, one_thread_each
 from ident.position_lines import wave_numbers
 from ident.posture import moved_by_gears
 from ident.problem import Problem, output_error
@@ -84,6 +84,7 @@ def signal_scale(
     )
 
 
+@one_thread_each
 def screen(
     problem: Problem, fit: Fit, predictions: Sequence[Prediction], hypotheses: Sequence[Hypothesis]
 ) -> list[Score]:

@@ -32,6 +32,7 @@ from ident.errors_in_variables import information_left, trusted_share
 from ident.extended import Prediction
 from ident.inverse import REMAINDER_STEPS
 from ident.model import Model, has_loop
+from ident.parallel import one_thread_each
 from ident.problem import Problem, Weights, data_count, data_counts, predictions
 from ident.weights import make_weights
 
@@ -143,6 +144,7 @@ def anneal(
     return replace(stages[-1], softer=tuple(stages[:-1]))
 
 
+@one_thread_each
 def fit(
     problem: Problem,
     model: Model,

@@ -24,7 +24,7 @@ def hide(robot, name, seed, folder):
     """A dataset with one effect of a kind; place, size and drives drawn."""
     rng = np.random.default_rng(seed)
     effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH.get(name, 2.0))
-    plan = small_plan(robot, seed, levels=(1.0,))
+    plan = small_plan(robot, seed, levels=(1.0,), period=1000)
     data = run_experiment(plan, [effect], seed=seed, drives=draw_drives(rng, robot), timestep=5e-4)
     return effect, through_files(data, folder)
 
@@ -168,7 +168,7 @@ def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
             spec.joint(f"link:{self.place}").damping = [coefficient, 0, 0]
 
     drives = draw_drives(np.random.default_rng(5), ur10)
-    data = run_experiment(small_plan(ur10, 5, points=1, levels=(1.0,)), [LinkFriction("elbow_joint")], seed=5, drives=drives)
+    data = run_experiment(small_plan(ur10, 5, points=1, levels=(1.0,), period=1000), [LinkFriction("elbow_joint")], seed=5, drives=drives)
     result = diagnose_fully(through_files(data, tmp_path))
     verdict = result.verdict
     assert verdict.unexplained_verdict == "unknown cause remains"

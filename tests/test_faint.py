@@ -45,7 +45,7 @@ def hypotheses(identified):
 def test_an_effect_within_the_error_of_the_noise_is_found(ur10, tmp_path, faint, beside):
     """Alone, and beside another one that is not faint."""
     effects = [parse_effect(text, ur10) for text in (*beside, faint)]
-    data = run_experiment(small_plan(ur10, 31), effects, seed=31, drives=draw_drives(np.random.default_rng(31), ur10), timestep=5e-4)
+    data = run_experiment(small_plan(ur10, 31, levels=(1.0,)), effects, seed=31, drives=draw_drives(np.random.default_rng(31), ur10), timestep=5e-4)
     verdict = diagnose(through_files(data, tmp_path))
     name, value = SIZES[faint]
     sure = {(c.effect, c.joint): c for c in verdict.causes if c.probability > 0.5}

@@ -2,12 +2,19 @@
 
 import json
 from concurrent.futures import ProcessPoolExecutor
+from inspect import signature
 from multiprocessing import get_context
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from ident.diagnosis import diagnose
+from ident.design import design_experiment
+from ident.diagnosis import diagnose, diagnose_fully
+from ident.estimate import fit_frf
+from ident.identification import identify
 from ident.parallel import Workers, map_threads, open_executor
+from ident.screening import screen
+from ident.torque_fit import fit
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from robot_assets.threads import thread_count
@@ -101,3 +108,22 @@ def test_functions_made_on_the_spot_reach_other_processes():
 def test_pieces_that_the_deadline_comes_before_are_left_out():
     assert Workers(deadline=0.0).map_in_time(lambda x: 2 * x, [1, 2], str) == [None, None]
     assert Workers().map_in_time(lambda x: 2 * x, [1, 2], str) == [2, 4]
+
+
+@pytest.mark.parametrize("function", [diagnose_fully, identify, screen, fit, fit_frf, design_experiment])
+def test_linear_algebra_starts_no_threads_within_what_users_call(function):
+    """Threads for each of many small matrices wait for each other, up to twenty times as long."""
+    seen = []
+
+    class Asked(Exception):
+        pass
+
+    class Probe:
+        def __getattr__(self, name):
+            seen.extend(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas")
+            raise Asked
+
+    needed = [p for p in signature(function).parameters.values() if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+    with threadpool_limits(2), pytest.raises(Asked):
+        function(**{p.name: Probe() for p in needed})
+    assert seen and set(seen) == {1}
