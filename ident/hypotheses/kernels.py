@@ -166,7 +166,6 @@ def along_motion(law: Law, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
     return torque - law.b * rate * (np.abs(x) < 0.5 * law.a) if law.code == BACKLASH else torque
 
 
-@njit(cache=True, nogil=True)
 def along_deflection(
     code: int,
     a: float,
@@ -187,16 +186,24 @@ def along_deflection(
     Args:
         x: (S, T) rad; mean: (S,) N m of ``k x`` and the law; bisections: at most; 0 leaves ``x`` where it is.
     """
+    if code == HYSTERESIS:
+        return along_path(np.diff(x, axis=1, prepend=x[:, -1:]), a, b, exponent, recoil)
+    return _moved_to_mean(code, a, b, k, x, mean, bisections)
+
+
+@njit(cache=True, nogil=True)
+def _moved_to_mean(
+    code: int, a: float, b: float, k: float, x: np.ndarray, mean: np.ndarray, bisections: int
+) -> np.ndarray:
+    """``along_deflection`` of a gear without memory."""
     S, T = x.shape
-    if code == 3:
-        steps = np.empty((S, T))
-        steps[:, 0] = x[:, 0] - x[:, T - 1]
-        steps[:, 1:] = x[:, 1:] - x[:, : T - 1]
-        return along_path(steps, a, b, exponent, recoil)
     out = np.empty((S, T))
     least = k if code != 2 else min(a, k)
     for i in range(S):
-        reach = abs(mean[i]) / least + np.abs(x[i]).max() + (a if code == 1 else b)
+        reach = 0.0
+        for t in range(T):
+            reach = max(reach, abs(x[i, t]))
+        reach += abs(mean[i]) / least + (a if code == 1 else b)
         low, high, offset = -reach, reach, 0.0
         last, too_low, too_high = 0, 0.0, 0.0  # misses at both ends, zero as long as one is not known
         for _step in range(bisections + 1):
