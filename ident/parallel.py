@@ -23,6 +23,8 @@ Arguments = ParamSpec("Arguments")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+ANSWER = 10.0  # s that a scheduler has to answer
+
 
 def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """``[function(x) for x in items]`` on a thread per core, in order.
@@ -154,7 +156,7 @@ def _dask(address: str) -> Iterator[Executor]:
     except ImportError as err:
         raise DataError("--executor", "this installation", "no Dask", "pip install 'simgap[dask]'") from err
     try:
-        client = Client(f"tcp://{address}", timeout="10s")
+        client = Client(f"tcp://{address}", timeout=ANSWER)
     except (OSError, ValueError) as err:
         raise DataError("--executor", f"dask://{address}", "no scheduler that answers", "a running Dask scheduler") from err
     with client:

@@ -456,6 +456,7 @@ def test_a_candidate_that_turned_far_goes_on_before_it_is_compared(identified, n
     assert begun == fits
 
 
+@pytest.mark.slow
 def test_a_step_that_is_cut_to_lead_uphill_does_not_end_a_fit(ur10, named):
     """Beside a loop, of a hinge that is begun too stiff and turned: parts of the step are cut, and what is left rises."""
     plan = small_plan(ur10, 1, points=1, levels=(1.0,), validation_points=0)

@@ -70,8 +70,9 @@ def test_an_executor_that_is_none_is_refused(text):
             pass
 
 
-def test_a_scheduler_that_does_not_answer_is_named():
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
     pytest.importorskip("distributed")
+    monkeypatch.setattr("ident.parallel.ANSWER", 1.0)
     with pytest.raises(DataError, match=r"127\.0\.0\.1:9"):
         with open_executor("dask://127.0.0.1:9"):
             pass
