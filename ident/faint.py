@@ -4,16 +4,22 @@ The sum of squares over all lines of all joints shows a cause only where it rais
 estimate of the noise. The response of one hypothesis is a few numbers, and known to far less: nothing but noise explains
 about 20 of the cost in the best of all hypotheses, on any arm, and a tenth more noise at each of many thousand lines
 no more than a tenth more of that (score test, Rao 1948; theory.md 9.3).
+
+Where the scatter between periods does not say how the noise is spread over the lines, what noise alone explains is told by
+what is left itself with its phases drawn anew, all joints of a line together: of the same spectrum and correlation, and no response.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy.stats
 
 from ident.baseline import DETECTION_EXCESS
+from ident.extended import Prediction
+from ident.group import Group
 from ident.hypotheses import Hypothesis
 from ident.model import has_rough_law, is_along_record
 from ident.noise import drifting
@@ -25,6 +31,8 @@ SEEN = 32.0  # fall of the cost in a linear step, over the noise, from which a f
 ROUGH = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws, or one under which single
 # records may be in another steady motion than the model
 LINEAR = 0.3  # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
+PHASES = 4  # draws of phases
+BY_PHASES = SEEN / 20.0  # factor on what the best of all hypotheses explains of those, from which a faint cause is sought
 SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 
 
@@ -41,7 +49,7 @@ def hidden(
     """
     scores = faint_scores(problem, current, hypotheses, told)
     clear = seen(scores, current)
-    if clear is None:
+    if clear is None or (not scatter_is_seen(problem) and clear.gain < BY_PHASES * by_phases(problem, current, hypotheses)):
         return (), 1.0
     chance = min(1.0, len(scores) * scipy.stats.chi2.sf(clear.gain, clear.dof))
     return tuple(s.hypothesis for s in scores if s.gain >= LINEAR * clear.gain), float(chance)
@@ -50,15 +58,13 @@ def hidden(
 def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray) -> list[Score]:
     """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
 
-    None where the noise is not measured by the scatter between periods, nor beside link encoders, of which the weights follow
-    what the model leaves. None where periods drift, at that joint or of the whole chain: a few numbers explain much of such
-    noise. None at the joint of a law along the record, which turns noise into a signal of its own there.
+    None of motions, nor beside link encoders, of which the weights follow what the model leaves. None where periods drift, at
+    that joint or of the whole chain: a few numbers explain much of such noise. None at the joint of a law along the record, which turns noise into a signal of its own there.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.
     """
-    measured = all(g.window is None and g.U_periods.shape[1] > 1 and not g.links for g in problem.groups)
-    if not measured:
+    if any(g.window is not None or g.links for g in problem.groups):
         return []
     along = {e.hypothesis.joint for e in current.model.effects if is_along_record(e.hypothesis)}
     drift = set(np.flatnonzero(drifting(problem.groups)))
@@ -68,6 +74,26 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
     at_joints = left_by_laws(current, told)
     scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
     return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]
+
+
+def scatter_is_seen(problem: Problem) -> bool:
+    """Whether the scatter between periods measures the noise of all records."""
+    return all(g.U_periods.shape[1] > 1 for g in problem.groups)
+
+
+def by_phases(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> float:
+    """What the best of all hypotheses explains of what a model leaves, with phases drawn anew: the most in a few draws."""
+    preds = predictions(problem, current.model, current.remainders)
+    rng = np.random.default_rng(PHASES)
+    draws = (replace(problem, groups=tuple(redrawn(g, p, rng) for g, p in zip(problem.groups, preds, strict=True))) for _ in range(PHASES))
+    return max(screen(draw, current, preds, hypotheses)[0].gain for draw in draws)
+
+
+def redrawn(group: Group, prediction: Prediction, rng: np.random.Generator) -> Group:
+    """A group of which what a model leaves has other phases, the same of all joints at a line; the sign at the mean."""
+    turn = np.exp(2j * np.pi * rng.random(group.U.shape[:2]))
+    turn[:, 0] = np.where(turn[:, 0].real > 0.0, 1.0, -1.0)
+    return replace(group, U=prediction.U + turn[..., None] * (group.U - prediction.U))
 
 
 def left_by_laws(current: Fit, told: np.ndarray) -> np.ndarray:

@@ -99,7 +99,7 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
     Args:
         groups: held-out data.
     """
-    periodic = tuple(g for g in groups if g.window is None and g.U_periods.shape[1] > 1)
+    periodic = tuple(g for g in groups if g.window is None)
     winner = found.candidates[0]
     if winner.hypothesis.decoy or not periodic or not settled(found.before):
         return False

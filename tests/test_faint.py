@@ -16,6 +16,7 @@ from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, hidden, left_
 from ident.hypotheses import catalogue
 from ident.model import Effect, along_record, as_loop
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
+from ident.problem import predictions
 from ident.refits import refit
 from ident.rounds import Round, temper_of, told_share, weighed_round
 from ident.search import hopeful
@@ -110,13 +111,42 @@ def test_a_noisier_joint_shows_less(identified, hypotheses):
     assert seen(loud, replace(baseline, costs=costs)) is None
 
 
-def test_nothing_faint_is_sought_where_the_noise_is_not_measured(identified, hypotheses):
+def single(group):
+    """A group as of one period."""
+    return replace(group, U_periods=group.U_periods[:, :1], Q_periods=group.Q_periods[:, :1])
+
+
+def test_nothing_faint_is_sought_beside_link_encoders(identified, hypotheses):
     _, setup, baseline = identified
-    problem, none = setup.problem, np.zeros(6)
-    group = problem.groups[0]
-    single = replace(group, U_periods=group.U_periods[:, :1], Q_periods=group.Q_periods[:, :1])
-    for other in (single, replace(group, links=(1,))):
-        assert faint_scores(replace(problem, groups=(other, *problem.groups[1:])), baseline, hypotheses, none) == []
+    problem = setup.problem
+    linked = replace(problem, groups=(replace(problem.groups[0], links=(1,)), *problem.groups[1:]))
+    assert faint_scores(linked, baseline, hypotheses, np.zeros(6)) == []
+
+
+@pytest.mark.parametrize(("size", "colour", "found"), [(0.0, 1.0, False), (0.01, 1.0, True), (0.0, 20.0, False)])
+def test_of_single_periods_phases_tell_what_noise_explains(identified, hypotheses, size, colour, found):
+    """Noise, an effect within it, and noise that rises towards the low lines of a joint, of which a few numbers explain much."""
+    _, setup, baseline = identified
+    problem, j, rng = setup.problem, 3, np.random.default_rng(2)
+    few = [h for h in hypotheses if h.joint == j and not h.on_chain]
+    friction = next(h for h in few if h.effect == "coulomb_friction")
+    true = replace(baseline.model, effects=(Effect(friction, np.array([size, 0.0, 5e-3])),) if size else ())
+    preds = [predictions(problem, m, baseline.remainders) for m in (baseline.model, true)]
+    groups = []
+    for group, before, after in zip(problem.groups, *preds, strict=True):
+        noise = np.zeros_like(group.U)
+        std = np.sqrt(problem.tau_std[j] ** 2 / problem.samples(group))
+        low = 1.0 / (1.0 + (np.arange(noise.shape[1]) / 20.0) ** 2)
+        noise[..., j] = (colour - 1.0) * std * low * (rng.normal(size=noise.shape[:2]) + 1j * rng.normal(size=noise.shape[:2]))
+        groups.append(single(replace(group, U=group.U + after.U - before.U + noise)))
+    problem = replace(problem, groups=tuple(groups))
+    quiet = replace(baseline, costs=baseline.counts.astype(float))
+    asked, chance = hidden(problem, quiet, few, np.zeros(6))
+    assert bool(asked) is found and (chance < 1e-6) is found
+    if colour > 1.0:
+        assert seen(faint_scores(problem, quiet, few, np.zeros(6)), quiet) is not None
+    if found:
+        assert friction in asked
 
 
 def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside_it_is(ur10, tmp_path):
