@@ -32,7 +32,7 @@ ROUGH = 10.0  # factor on that beside a law along the record, whose noise is kno
 # records may be in another steady motion than the model
 LINEAR = 0.3  # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
 PHASES = 4  # draws of phases
-BY_PHASES = SEEN / 20.0  # factor on what the best of all hypotheses explains of those, from which a faint cause is sought
+BY_PHASES = 2.5  # factor on what the best of all hypotheses explains of those, from which a faint cause is sought
 SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 
 

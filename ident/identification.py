@@ -98,8 +98,8 @@ def runaways(dataset: Dataset) -> tuple[str, ...]:
 
 
 def moves(dataset: Dataset, q_std: np.ndarray) -> bool:
-    """Whether any joint moves beyond the noise of its position (n,) in any segment."""
-    return any(np.any(np.std(s.q, axis=0) > MOVES * q_std) for s in dataset.segments)
+    """Whether any joint moves beyond the noise of its position (n,) in any identification segment."""
+    return any(np.any(np.std(s.q, axis=0) > MOVES * q_std) for s in dataset.select(role="identification"))
 
 
 def with_held_out(dataset: Dataset) -> Dataset:
@@ -120,12 +120,10 @@ def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) 
     """Highest compared frequency of motions, Hz: below the modes of the links on standing motors.
 
     Near such a mode the torque depends on how the links swung before the record began, which no
-    record of the motors tells.
+    record of the motors tells. Held-out motions say nothing of it but where there are no others.
     """
     lowest = np.inf
-    for segment in dataset.segments:
-        if segment.kind != "trajectory":
-            continue
+    for segment in dataset.select(role="identification", kind="trajectory") or dataset.select(kind="trajectory"):
         for q in segment.q[:: max(1, len(segment.q) // POSTURES)]:
             lin = linearise(structure, equilibrium(structure, nominal, q))
             K = np.diag(stiffness_diagonal(structure, nominal)) + lin.Kg
@@ -135,7 +133,7 @@ def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) 
 
 
 def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Sample noise of position and torque: as given, else from fourth differences of the data.
+    """Sample noise of position and torque: as given, else from fourth differences of the identification segments.
 
     A torque that is not held from sample to sample may be made by a faster loop, of which the record holds single samples: what circulates
     there folds into all lines, and is noise beside that which is given.
@@ -147,7 +145,7 @@ def _noise_of(dataset: Dataset, channel: str) -> np.ndarray:
     given = given_noise(dataset, channel)
     if given is not None and (channel == "q" or dataset.input_hold == "zoh"):
         return given
-    each = np.median([difference_noise(getattr(s, channel)) for s in dataset.segments], axis=0)
+    each = np.median([difference_noise(getattr(s, channel)) for s in dataset.select(role="identification")], axis=0)
     return np.maximum(each, least_noise(dataset, channel))
 
 
@@ -162,7 +160,7 @@ def least_noise(dataset: Dataset, channel: str) -> np.ndarray:
     given = given_noise(dataset, channel)
     if given is not None:
         return given
-    size = np.median([np.std(getattr(s, channel), axis=0) for s in dataset.segments], axis=0)
+    size = np.median([np.std(getattr(s, channel), axis=0) for s in dataset.select(role="identification")], axis=0)
     return np.maximum(LEAST_NOISE[channel] * size, 1e-9 if channel == "q" else 1e-6)
 
 

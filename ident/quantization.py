@@ -38,15 +38,15 @@ class Steps:
 
 
 def find_steps(dataset: Dataset, q_std: np.ndarray) -> tuple[Steps, ...]:
-    """Joints whose motor position comes in steps that are coarse against its noise.
+    """Joints whose motor position comes in steps that are coarse against its noise, by the identification segments.
 
     Args:
         q_std: (n,) sample noise that the robot or the dataset declares, rad.
     """
     out = []
     for j in range(dataset.n):
-        periodic = [s for s in dataset.segments if s.kind == "multisine"]
-        moving = max(periodic or dataset.segments, key=lambda s: float(np.ptp(s.q[:, j])))
+        periodic = dataset.select(role="identification", kind="multisine")
+        moving = max(periodic or dataset.select(role="identification"), key=lambda s: float(np.ptp(s.q[:, j])))
         q = moving.q[:: max(1, len(moving.q) // SAMPLES), j]
         found = _exact_grid(q)
         if found is None:

@@ -75,12 +75,10 @@ def build_groups(
 
 
 def highest_line_hz(dataset: Dataset) -> float:
-    """Highest excited frequency of the identification multisines, Hz; 0.4 of Nyquist without."""
-    tops = [
-        max(s.excited_lines) * dataset.sample_rate / s.period
-        for s in dataset.segments
-        if s.kind == "multisine" and len(s.excited_lines)
-    ]
+    """Highest excited frequency of the identification multisines, Hz; of held-out ones where there are no others, 0.4 of Nyquist without."""
+    excited = [s for s in dataset.select(kind="multisine") if len(s.excited_lines)]
+    told = [s for s in excited if s.role == "identification"] or excited
+    tops = [max(s.excited_lines) * dataset.sample_rate / s.period for s in told]
     return float(max(tops)) if tops else 0.2 * dataset.sample_rate
 
 

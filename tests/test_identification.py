@@ -17,7 +17,7 @@ from ident.frf import estimate_frf
 from ident.gain import segment_errors
 from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
 from ident.hypotheses import catalogue
-from ident.identification import set_up
+from ident.identification import identify, set_up
 from ident.model import Effect, Model
 from ident.problem import output_error, predictions
 from ident.refits import reweighted
@@ -85,6 +85,31 @@ def test_a_held_out_segment_that_ran_away_tells_nothing(clean):
     told, all_of_them = ({n for g in x.held_out for n in g.segments} for x in (setup, whole))
     assert told == all_of_them - {lost} and told
     assert any(lost in note for note in diagnose(replace(data, segments=segments), max_causes=0).notes)
+
+
+@pytest.mark.parametrize("kind", ["multisine", "trajectory"])
+def test_held_out_data_change_nothing_of_what_is_fitted(kind):
+    """Neither their noise, nor their band, nor steps of their encoder: of data whose noise is not given and does not show between periods."""
+    robot = load_robot("twomass")
+    plan = small_plan(robot, 3, points=1, levels=(10.0,), period=500, periods=2, trajectory=True)
+    data = run_experiment(plan, [], seed=3)
+    told = tuple(s for s in data.segments if s.role == "identification") if kind == "multisine" else ()
+    held_out = [s for s in data.segments if s.role == "validation"]
+    if kind == "trajectory":
+        told = tuple(replace(s, role="identification") for s in held_out if s.kind == kind)
+    assert told and held_out
+
+    def changed(s):
+        rng = np.random.default_rng(0)
+        lines = np.union1d(s.excited_lines, [200]) if s.kind == "multisine" else s.excited_lines
+        q = np.round(s.q + 1e-4 * rng.normal(size=s.q.shape), 3)
+        return replace(s, name=f"held-{s.name}", q=q, tau=5.0 * s.tau + rng.normal(size=s.tau.shape), excited_lines=lines)
+
+    plain = replace(data, q_std=None, tau_std=None)
+    a, b = (identify(replace(plain, segments=(*told, *more))) for more in ((), map(changed, held_out)))
+    assert np.array_equal(a[0].problem.q_std, b[0].problem.q_std) and np.array_equal(a[0].problem.tau_std, b[0].problem.tau_std)
+    assert [g.n_compared for g in a[0].problem.groups] == [g.n_compared for g in b[0].problem.groups]
+    assert a[0].steps == b[0].steps and np.array_equal(pack(a[1].model), pack(b[1].model))
 
 
 def test_nothing_hidden_nothing_named(clean):
