@@ -15,7 +15,7 @@ import pinocchio as pin
 from ident.excitation import TORQUE_SHARE
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
-from robot_assets.urdf import read_urdf
+from robot_assets.urdf import completed, read_urdf
 
 MARGIN = 0.05  # of each joint range, at most 0.1 rad, left free at either end for the excitation
 ALWAYS = 0.95  # share of postures from which a touching pair is taken for drawn too fat
@@ -103,7 +103,7 @@ def reach(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 def build_body(robot: Robot, rng: np.random.Generator) -> Body:
     """Kinematics of a robot and the pairs of its links that can collide."""
-    model = pin.buildModelFromUrdf(str(robot.urdf))
+    model = pin.buildModelFromXML(completed(robot.urdf))
     model.gravity.linear = np.asarray(robot.gravity, float)
     frames = {f.name: model.getFrameId(f.name) for f in model.frames if f.type == pin.FrameType.BODY}
     for load in robot.loads:
@@ -143,7 +143,7 @@ def _set(model: pin.Model, full: np.ndarray, joints, angles) -> None:
 def _geometry(robot: Robot, model: pin.Model) -> tuple[pin.GeometryModel | None, str]:
     folders = [str(robot.mesh_dir)] if robot.mesh_dir else []
     try:
-        geometry = pin.buildGeomFromUrdf(model, str(robot.urdf), pin.GeometryType.COLLISION, None, folders)
+        geometry = pin.buildGeomFromUrdfString(model, completed(robot.urdf), pin.GeometryType.COLLISION, None, folders)
     except Exception as err:
         return None, f"self-collision not checked: {str(err).splitlines()[0]}"
     if geometry.ngeoms == 0:

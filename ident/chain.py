@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 from robot_assets.errors import DataError
 from robot_assets.robot import Elasticity, Robot
+from robot_assets.urdf import completed
 
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 
@@ -187,7 +189,7 @@ def _read_chain(
     urdf: str, changed: int, joint_names: tuple[str, ...], locked: tuple[tuple[str, float], ...], folder: str
 ) -> pin.Model:
     try:
-        full = pin.buildModelFromUrdf(urdf)
+        full = pin.buildModelFromXML(completed(Path(urdf)))
     except Exception as err:
         raise DataError("URDF", urdf, str(err).splitlines()[0], "a readable URDF") from err
     movable = set(full.names[1:])

@@ -107,7 +107,7 @@ def diagnose_fully(
     if harmful(gain):
         names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
         notes.append(
-            f"Taken back: {names}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
+            f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
             f" {gain.before:.3g} {torque_unit(dataset.robot)}."
         )
         result, rigid = replace(result, rounds=(), final=baseline, unknown=True), None

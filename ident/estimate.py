@@ -39,6 +39,7 @@ STEP, SMALL = 1.0, 0.1  # longest step in a log-parameter, and what may be taken
 REACH = 6.0  # bound on the change of a log-parameter in one minimisation
 PORTION = 32  # lines evaluated at a time
 TIMING = 0.6  # bound on the timing, samples
+ROUNDED = 1e-9  # standard deviation of an entry over its size, at least: what rounding leaves of records without noise
 NULL = 1e-12  # share of the scaled information below which a direction counts as unseen
 
 
@@ -105,6 +106,10 @@ def fit_frf(
         raise DataError("FRF", "fit_frf", f"{frf.G.shape[-1]} motors", f"{structure.n}, those of the arm")
     if estimator in ("wnls", "wlls") and not np.all(np.einsum("qfii->qfi", frf.covariance).real > 0):
         raise DataError("covariance", "fit_frf", "an entry without variance", "a positive one for each")
+    k = np.arange(frf.covariance.shape[-1])
+    covariance = frf.covariance.copy()
+    covariance[..., k, k] += (ROUNDED * np.abs(frf.G).swapaxes(-1, -2).reshape(*frf.G.shape[:2], -1)) ** 2
+    frf = replace(frf, covariance=covariance)
     names = (*parameter_names(structure.robot), "timing")
     stray = sorted(set(fitted or ()) - set(names))
     if stray:

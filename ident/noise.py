@@ -22,6 +22,7 @@ LEVEL_STEPS = 60  # towards the likeliest levels
 LEAST_LEVEL, MOST_LEVEL = 1e-5, 1e5  # of the noise of the torque, over the quietest line, between which it is sought
 ROUGH_LEVELS, LEVELS = 60, 120  # of it over that range, and over the part of it that is likely
 UNLIKELY = 20.0  # nats below the likeliest level
+ROUNDED = 1e-9  # noise of the torque over its size, at least: what rounding leaves of records without noise
 LEAST_VARIANCE = 1e-140  # of a line, of records without any noise
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
@@ -65,13 +66,14 @@ def residual_covariance(
     (``_scatter``) sets its size, and corrects its shape by a smooth matrix where there is enough of it.
     """
     found = _scatter(group, Z)
+    rounded = ROUNDED**2 * np.mean(np.sum(2.0 * np.abs(group.U[:, 1:]) ** 2, axis=1), axis=0) / samples
     if found is None:
-        S = white_covariance(Z, tau_std**2 / samples, q_std**2 / samples)
+        S = white_covariance(Z, tau_std**2 / samples + rounded, q_std**2 / samples)
         return S[: group.n_compared]
     d, lines, dof_line = found
     Zk = Z[: group.n_compared]
     tau_var, q_var = group.known_noise or _white_levels(np.sum(np.abs(d[:, 1:]) ** 2, axis=0), Zk[lines[1:]], np.full(len(lines) - 1, dof_line))
-    S = white_covariance(Zk, tau_var, q_var)
+    S = white_covariance(Zk, tau_var + rounded, q_var)
     root = np.linalg.cholesky(S)
     white = np.linalg.solve(root[lines][None], d[..., None])[..., 0]
     scatter = np.einsum("ski,skj->kij", white, white.conj(), optimize=True)

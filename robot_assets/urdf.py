@@ -18,6 +18,8 @@ MOST = 1000  # links, and joints
 NEGATIVE = 1e-3  # of the largest moment of inertia: what rounding in a file may leave below zero
 EXCESS = 0.02  # of the largest moment, by which it may exceed the other two together: rounding in a file
 SLIGHT = 1e-5  # kg m2, the same: placeholders of links that weigh nothing
+LIMIT = {"lower": -np.pi, "upper": np.pi, "effort": 0.0, "velocity": 0.0}  # of a joint that says nothing of them
+MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 DEEPEST = 100  # elements inside elements: parsers of the engines recurse
 
 
@@ -151,12 +153,29 @@ def _check_mimics(joints: list[tuple[str, ET.Element]], path: Path) -> None:
             raise DataError(f"mimic of joint {name}", str(path), repr(leads[name]), "a joint of the URDF")
 
 
+def completed(path: Path) -> str:
+    """The text of a URDF, with what some readers demand and it does not say: limits (``LIMIT``) and products of inertia."""
+    root = _root(path)
+    for joint in root.iter("joint"):
+        if joint.get("type") in ("revolute", "prismatic"):
+            limit = joint.find("limit")
+            _complete(ET.SubElement(joint, "limit") if limit is None else limit, LIMIT)
+    for tensor in root.iter("inertia"):
+        _complete(tensor, dict.fromkeys(MOMENTS, 0.0))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _complete(element: ET.Element, values: dict[str, float]) -> None:
+    for key in values.keys() - element.keys():
+        element.set(key, str(values[key]))
+
+
 def _limit(joint: ET.Element, name: str, path: Path) -> tuple[float, float]:
     limit = joint.find("limit")
     if limit is None or joint.get("type") == "continuous":
-        return -np.pi, np.pi
-    low = _number(limit.get("lower", str(-np.pi)), f"lower limit of joint {name}", path)
-    high = _number(limit.get("upper", str(np.pi)), f"upper limit of joint {name}", path)
+        return LIMIT["lower"], LIMIT["upper"]
+    low = _number(limit.get("lower", str(LIMIT["lower"])), f"lower limit of joint {name}", path)
+    high = _number(limit.get("upper", str(LIMIT["upper"])), f"upper limit of joint {name}", path)
     if low >= high:
         raise DataError(f"limit of joint {name}", str(path), f"{low:g} to {high:g}", "a lower limit below the upper")
     return low, high
@@ -172,7 +191,7 @@ def _check_inertial(inertial: ET.Element | None, link: str, path: Path) -> None:
     if _number(mass.get("value"), f"mass of link {link}", path) < 0:
         raise DataError(f"mass of link {link}", str(path), str(mass.get("value")), "at least zero")
     xx, yy, zz, xy, xz, yz = (
-        _number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        _number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in MOMENTS
     )
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if moments.min() < -NEGATIVE * np.abs(moments).max():

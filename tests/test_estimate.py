@@ -84,6 +84,16 @@ def test_drives_off_by_two_are_found(arm, estimator):
     assert not result.undetermined
 
 
+@pytest.mark.parametrize("estimator", ["wnls", "wlls"])
+def test_records_without_noise_are_fitted_to_what_rounding_leaves(arm, estimator):
+    """A simulation without noise repeats to the last digit: covariances next to nothing, or none of some lines but rounding."""
+    structure, _, truth, postures = arm
+    frf = measured(model_of(structure, truth, postures), postures, np.random.default_rng(0), relative=1e-12)
+    frf = replace(frf, covariance=1e-306 * (1.0 + np.arange(len(BAND)))[None, :, None, None] * np.eye(structure.n**2, dtype=complex)[None, None].repeat(len(postures), 0))
+    result = fit(arm, frf, estimator=estimator)
+    assert np.all(np.isfinite(result.covariance)) and np.abs(log_error(result, truth)).max() < 1e-5
+
+
 def test_the_sag_is_solved_for_the_parameters_found(arm):
     """Without noise every estimator ends at the truth itself, from springs four times too soft."""
     structure, nominal, truth, postures = arm

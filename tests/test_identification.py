@@ -112,6 +112,21 @@ def test_held_out_data_change_nothing_of_what_is_fitted(kind):
     assert a[0].steps == b[0].steps and np.array_equal(pack(a[1].model), pack(b[1].model))
 
 
+def test_what_rounding_leaves_of_records_without_noise_is_no_discrepancy():
+    """Exact periods of the arm that is fitted, to the last digits but a few."""
+    robot = load_robot("twomass")
+    data = run_experiment(small_plan(robot, 3, points=1, levels=(10.0,), period=500, periods=3), [], seed=3, noise=0.0)
+    problem = set_up(data).problem
+    preds = predictions(problem, Model(problem.structure, problem.nominal), [None] * len(problem.groups), steps=None)
+    groups = []
+    for g, p in zip(problem.groups, preds, strict=True):
+        U = p.U * (1.0 + 1e-13 * np.random.default_rng(1).normal(size=p.U.shape))
+        groups.append(replace(g, U=U, U_periods=U[:, None].repeat(2, 1), Q_periods=g.Q[:, None].repeat(2, 1)))
+    exact = replace(problem, groups=tuple(groups))
+    weights = make_weights(exact, preds, 0.0)
+    assert np.sum(joint_costs(exact, preds, weights)) < 0.01 * exact.groups[0].n_compared
+
+
 def test_nothing_hidden_nothing_named(clean):
     verdict = diagnose(clean[0])
     assert not verdict.discrepancy.detected and not verdict.causes

@@ -2,8 +2,12 @@
 
 import warnings
 
+import numpy as np
 import pytest
 
+from ident.candidates import build_body
+from ident.chain import build_structure
+from ident.graybox import linearise
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import write_robot
 from robot_assets.robot import load_robot
@@ -76,3 +80,37 @@ def test_the_command_prints_what_is_hardly_so(tmp_path):
     result = run("robot", tmp_path / "arm.urdf", "--out", tmp_path / "out")
     assert result.returncode == 0 and "warning: the centre of mass of link upper is 200 m off" in result.stdout and not result.stderr
     assert load_robot(tmp_path / "out").n == 2
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize("limit", ["", '<limit effort="80"/>', '<limit lower="-2" upper="2"/>'])
+def test_a_joint_that_says_nothing_of_its_limits_is_like_any_other(tmp_path, capfd, kind, limit):
+    """Some readers refuse a joint without a limit, or without its effort or velocity."""
+    given = '<limit lower="-2" upper="2" effort="80" velocity="3"/>'
+    chains, postures = [], np.array([0.3, -0.2])
+    for name, text in (("with", given), ("without", limit)):
+        (tmp_path / name).mkdir()
+        of = ARM.replace('name="shoulder" type="revolute"', f'name="shoulder" type="{kind}"').replace(given, text)
+        (tmp_path / name / "arm.urdf").write_text(of)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            write_robot(tmp_path / name / "arm.urdf", tmp_path / name / "out", None)
+        robot = load_robot(tmp_path / name / "out")
+        chains.append(linearise(build_structure(robot), postures))
+        build_body(robot, np.random.default_rng(0))
+    assert np.array_equal(chains[0].M, chains[1].M) and np.array_equal(chains[0].g, chains[1].g)
+    assert capfd.readouterr().err == ""
+
+
+def test_products_of_inertia_that_are_not_said_are_none(tmp_path, capfd):
+    """A reader that misses one of them leaves out the whole tensor."""
+    given = ARM.replace("ixx=", 'ixy="0" ixz="0" iyz="0" ixx=')
+    tensors = []
+    for name, text in (("with", given), ("without", ARM)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "arm.urdf").write_text(text)
+        write_robot(tmp_path / name / "arm.urdf", tmp_path / name / "out", None)
+        structure = build_structure(load_robot(tmp_path / name / "out"))
+        tensors.append([i.inertia for i in structure.model.inertias])
+    assert np.array_equal(tensors[0], tensors[1]) and np.trace(tensors[1][1]) == pytest.approx(0.11)
+    assert capfd.readouterr().err == ""

@@ -15,6 +15,7 @@ from ident.units import response_unit, torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis, TorqueTrace
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
+from robot_assets.urdf import completed
 
 FOOTER = 32  # bytes at the end of a recording, its mark among them
 FRAMES_PER_SECOND = 30.0
@@ -162,9 +163,10 @@ def _log_arm(stream: rr.RecordingStream, diagnosis: Diagnosis, trace: TorqueTrac
 def _log_meshes(stream: rr.RecordingStream, robot: Robot) -> bool:
     """Collision meshes under the driven joints that carry them; False where no file is found."""
     try:
-        full = pin.buildModelFromUrdf(str(robot.urdf))
-        shapes = pin.buildGeomFromUrdf(
-            full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=[str(robot.mesh_dir or robot.folder)]
+        text = completed(robot.urdf)
+        full = pin.buildModelFromXML(text)
+        shapes = pin.buildGeomFromUrdfString(
+            full, text, pin.GeometryType.COLLISION, package_dirs=[str(robot.mesh_dir or robot.folder)]
         )
         fixed = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
         full, shapes = pin.buildReducedModel(full, shapes, fixed, _locked(full, robot))
