@@ -20,7 +20,8 @@ import scipy.signal
 from ident.chain import build_structure
 from ident.dataset import Dataset
 from ident.group import Group
-from ident.identification import set_up, with_held_out
+from ident.held_out import with_held_out
+from ident.identification import set_up
 from ident.verdict import Diagnosis
 
 CUTOFF = 2.0  # of the low pass of the positions, in multiples of the compared band

@@ -17,6 +17,7 @@ from ident.channel_checks import (
     unit_warnings,
 )
 from ident.dataset import CHANNELS, Dataset, Segment
+from ident.held_out import not_fitted, with_held_out
 from ident.parallel import one_thread_each
 from ident.period_checks import period_warnings
 from ident.rest import difference_noise
@@ -144,23 +145,52 @@ def _range(signals: list[np.ndarray]) -> tuple[tuple[float, float], ...]:
 
 
 def _present(segments: tuple[Segment, ...], channel: str, n: int) -> tuple[int, ...]:
-    """Joints, from 1, whose channel holds values in every segment."""
-    signals = [getattr(s, channel) for s in segments]
-    if any(x is None for x in signals):
-        return ()
-    return tuple(j + 1 for j in range(n) if all(np.all(np.isfinite(x[:, j])) for x in signals))
+    """Joints, from 1, whose channel holds values in some segment."""
+    counts = _holding(segments, channel, n)
+    return tuple(j + 1 for j in range(n) if counts[j])
+
+
+def _holding(segments: tuple[Segment, ...], channel: str, n: int) -> list[int]:
+    """Number of segments in which the channel of each joint holds values."""
+    signals = [x for s in segments if (x := getattr(s, channel)) is not None]
+    return [sum(bool(np.all(np.isfinite(x[:, j]))) for x in signals) for j in range(n)]
+
+
+def _partial(dataset: Dataset) -> list[str]:
+    """Measured channels that some segments hold and others do not; references go with the kind of a segment."""
+    out = []
+    for channel in ("q_link", "temp"):
+        counts, all_of_them = _holding(dataset.segments, channel, dataset.n), len(dataset.segments)
+        some = [j + 1 for j in range(dataset.n) if 0 < counts[j] < all_of_them]
+        if some:
+            most = max(counts[j - 1] for j in some)
+            out.append(f"{channel} of joint{'s' if len(some) > 1 else ''} {', '.join(map(str, some))} in {most} of {all_of_them} segments only")
+    return out
+
+
+def _without_validation(dataset: Dataset) -> str:
+    """How the gain is measured of data of which none are held out."""
+    fitted = dataset.select(role="identification")
+    if with_held_out(dataset) is not dataset:
+        return "the end of the only motion will be held out"
+    points = {s.operating_point for s in fitted if s.kind == "multisine"} or {s.name for s in fitted}
+    if len(points) < 2:
+        return "with a single operating point no gain can be measured"
+    return "the gain will be measured by leaving operating points out"
 
 
 def _warnings(dataset: Dataset) -> list[str]:
     out = []
     if not any(s.role == "validation" for s in dataset.segments):
-        out.append("no validation segments: the gain will be measured by leaving operating points out")
+        out.append(f"no validation segments: {_without_validation(dataset)}")
     if not any(s.role == "identification" for s in dataset.segments):
         out.append("no identification segments: there is nothing to fit")
-    out += _brief_warnings(dataset)
+    out += [*_brief_warnings(dataset), *not_fitted(dataset), *_partial(dataset)]
     alike: dict[str, list[str]] = {}
     for s in dataset.segments:
         found = [w for check in CHECKS for w in check(s, dataset)]
+        if s.kind == "multisine" and not len(s.excited_lines):
+            found.append("excited_lines are not said: no FRFs can be estimated")
         if s.kind == "multisine" and s.steady_periods < 2:
             found.append("one steady period; noise cannot be told from the scatter between periods")
         for w in found:

@@ -433,7 +433,7 @@ def _verdict_text(diagnosis: Diagnosis, out: Path) -> str:
         g = verdict.gain
         of = f" at {', '.join(g.joints)}" if g.of_some else ""
         over_all = f"; of all joints {g.over_all[0]:.4g} -> {g.over_all[1]:.4g}" if g.of_some else ""
-        unit = torque_unit(diagnosis.robot)
+        unit = torque_unit(diagnosis.robot, g.joints)
         lines.append(f"Torque error on held-out data{of}: {g.before:.4g} -> {g.after:.4g} {unit}, noise {g.noise_floor:.4g}{over_all}")
     lines.append(f"Unexplained: {verdict.unexplained_verdict} ({verdict.unexplained_share:.2%})")
     if verdict.residual_description:

@@ -18,8 +18,9 @@ from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import Parameters
 from ident.group import Group
+from ident.held_out import not_fitted, with_held_out
 from ident.hypotheses.sensing import torque_offset
-from ident.identification import RUNAWAY, Setup, identify, set_up, under_noise_beside_causes, with_held_out
+from ident.identification import RUNAWAY, Setup, identify, set_up, under_noise_beside_causes
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
 from ident.next_experiment import separating_experiment
@@ -31,7 +32,7 @@ from ident.rigid import RigidFit, carried_over, fit_rigid
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, fit
 from ident.trust import LEFT_ERROR, denied, known_probability
-from ident.units import torque_unit
+from ident.units import torque_unit, units_of_torques
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 
 LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
@@ -108,7 +109,7 @@ def diagnose_fully(
         names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
         notes.append(
             f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
-            f" {gain.before:.3g} {torque_unit(dataset.robot)}."
+            f" {gain.before:.3g} {torque_unit(dataset.robot, gain.joints)}."
         )
         result, rigid = replace(result, rounds=(), final=baseline, unknown=True), None
         gain, shown, pairs = tested(result)
@@ -123,6 +124,9 @@ def diagnose_fully(
         notes.append(f"Not among the held-out data: {names}. Torques above {RUNAWAY:g} times those of the others say that the loop was lost.")
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
+    notes += [f"Not used: {line}." for line in not_fitted(given)]
+    if gain is None and not setup.held_out:
+        notes.append("No gain is measured: nothing is held out, and of a single operating point nothing can be left out.")
     verdict = replace(verdict, notes=(*verdict.notes, *notes))
     if doubts:
         verdict = withdrawn(verdict, doubts)
@@ -172,7 +176,7 @@ def held_out(
     problem, before, after = setup.problem, baseline.model, result.final.model
     if setup.held_out:
         errors, pairs = segment_errors(problem, setup.held_out, before, after)
-        gain = measure_gain(errors, problem.structure.robot.joint_names, affected, method, np.random.default_rng(SEED))
+        gain = measure_gain(errors, units_of_torques(problem.structure.robot), affected, method, np.random.default_rng(SEED))
         return gain, tuple(g for g in setup.held_out if g.segments[0] in errors.segments), pairs
     gain = leave_one_out(setup, nominal, baseline, result, renewed, affected, workers)
     shown = problem.groups[:1]
@@ -323,7 +327,7 @@ def leave_one_out(
     )
     return measure_gain(
         joined,
-        problem.structure.robot.joint_names,
+        units_of_torques(problem.structure.robot),
         affected,
         "leave-one-operating-point-out",
         np.random.default_rng(SEED),

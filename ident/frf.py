@@ -12,6 +12,8 @@ For realization m the spectra of the n_u experiments form ``U, Y, R`` (n, n_u) a
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,12 +112,10 @@ def average(blocks: Blocks, estimator: str) -> np.ndarray:
 
 
 def _blocks(members: list[Segment], lines: np.ndarray, frequency: np.ndarray, n: int, name: str) -> Blocks:
-    by_realization: dict[int, dict[int, Segment]] = {}
-    for i, s in enumerate(members):
-        by_realization.setdefault(s.realization or 1, {}).setdefault(s.experiment or i + 1, s)
-    complete = [r for r in by_realization.values() if len(r) >= n]
+    sets = experiment_sets(members, n)
+    complete = [r for r in sets if len(r) == n]
     if not complete:
-        most = max(len(r) for r in by_realization.values())
+        most = max(len(r) for r in sets)
         raise DataError("experiments", f"operating point {name}", f"{most}", f"{n}, one per input")
     periods = min(s.steady_periods for r in complete for s in r.values())
     acceleration = -((2 * np.pi * frequency) ** 2)
@@ -126,7 +126,7 @@ def _blocks(members: list[Segment], lines: np.ndarray, frequency: np.ndarray, n:
     U, Y, R = [], [], []
     with_r = all(s.r is not None for r in complete for s in r.values())
     for r in complete:
-        chosen = [r[k] for k in sorted(r)][:n]
+        chosen = [r[k] for k in sorted(r)]
         U.append(np.stack([spectra(s, "tau") for s in chosen], axis=-1))
         Y.append(np.stack([spectra(s, "q") for s in chosen], axis=-1) * acceleration[:, None, None])
         if with_r:
@@ -137,6 +137,27 @@ def _blocks(members: list[Segment], lines: np.ndarray, frequency: np.ndarray, n:
     if reference is not None and np.any(np.linalg.cond(reference) > 1e8):
         reference = None
     return Blocks(np.stack(U), np.stack(Y), reference)
+
+
+def experiment_sets(members: Sequence[Segment], n: int) -> list[dict[int, Segment]]:
+    """Segments of one operating point in sets of up to ``n`` experiments, by their number, 1 to ``n``.
+
+    Those of a realization make a set; what is repeated there, and experiments beyond ``n``, make further ones. Segments
+    that do not say which experiment they are follow one another.
+    """
+    sets: dict[tuple[int, int, int], dict[int, Segment]] = {}
+    unnumbered, times = Counter[int](), Counter[tuple[int, int]]()
+    for s in members:
+        realization = s.realization or 1
+        if s.experiment:
+            experiment = int(s.experiment) - 1
+        else:
+            experiment = unnumbered[realization]
+            unnumbered[realization] += 1
+        k = times[realization, experiment]
+        times[realization, experiment] += 1
+        sets.setdefault((realization, experiment // n, k), {})[experiment % n + 1] = s
+    return list(sets.values())
 
 
 def _covariance(

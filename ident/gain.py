@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from ident.problem import Problem
 from ident.stiction import as_held, held_share
 from ident.verdict import Gain, JointGain
 
-METRIC = "RMS motor-torque prediction error, N m"
+METRIC = "RMS motor-torque prediction error"
 STRETCHES = 8  # of a motion
 RESAMPLES = 2000
 
@@ -100,7 +100,7 @@ def stretch_squares(group: Group, lines: np.ndarray, parts: int) -> np.ndarray:
 
 def measure_gain(
     errors: Errors,
-    joints: tuple[str, ...],
+    joints: Mapping[str, str],
     affected: Sequence[int],
     method: str,
     rng: np.random.Generator,
@@ -114,9 +114,11 @@ def measure_gain(
     predicted.
 
     Args:
+        joints: unit of the torque of each.
         affected: the joints over which errors are taken: those that carry the discrepancy in the
             identification data (all where there is none), so that the noise of a large joint does
             not hide what is gained at a small one. ``by_joint`` tells all of them.
+        metric: what the errors are of, to which their unit is added.
     """
     if not errors.segments:
         return None
@@ -140,5 +142,6 @@ def measure_gain(
         b, a, f = (np.sqrt(x[pick].mean(axis=1) / n) for x in (errors.before, errors.after, errors.noise))
         ratio = (b - a) / np.maximum(b - f, 1e-300)
         interval = tuple(float(v) for v in np.quantile(ratio, [0.025, 0.975]))
-    told = tuple(dict.fromkeys(errors.segments))
-    return Gain(told, metric, before, after, noise, closed, interval, method, tuple(joints[j] for j in pick_joints), by_joint)
+    told, of = tuple(dict.fromkeys(errors.segments)), tuple(list(joints)[j] for j in pick_joints)
+    unit = " or ".join(sorted({joints[name] for name in of}, reverse=True))
+    return Gain(told, f"{metric}, {unit}", before, after, noise, closed, interval, method, of, by_joint)

@@ -30,8 +30,6 @@ MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
 MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
-HELD_OUT_SHARE = 1.0 / 3.0  # of a single motion
-LEAST_HELD_OUT = 2.0  # s of it
 RENEWALS = 3  # at most, of such noise
 LOUD = 2.0  # power of noise as it was guessed, over that which is found, from which it is lowered
 RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
@@ -100,20 +98,6 @@ def runaways(dataset: Dataset) -> tuple[str, ...]:
 def moves(dataset: Dataset, q_std: np.ndarray) -> bool:
     """Whether any joint moves beyond the noise of its position (n,) in any identification segment."""
     return any(np.any(np.std(s.q, axis=0) > MOVES * q_std) for s in dataset.select(role="identification"))
-
-
-def with_held_out(dataset: Dataset) -> Dataset:
-    """The dataset, its end held out where it is a single motion: nothing else would test what is named."""
-    if len(dataset.segments) != 1 or dataset.segments[0].kind != "trajectory":
-        return dataset
-    whole = dataset.segments[0]
-    cut = round((1.0 - HELD_OUT_SHARE) * whole.n_samples)
-    if (whole.n_samples - cut) / dataset.sample_rate < LEAST_HELD_OUT:
-        return dataset
-
-    first = replace(whole, role="identification", **whole.part(slice(None, cut)))
-    last = replace(whole, name=f"{whole.name}-end", role="validation", **whole.part(slice(cut, None)))
-    return replace(dataset, segments=(first, last))
 
 
 def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) -> float:

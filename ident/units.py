@@ -71,9 +71,15 @@ def response_unit(robot: Robot) -> str:
     return "(m/s²)/N" if torque_unit(robot) == "N" else "(rad/s²)/(N m)"
 
 
-def torque_unit(robot: Robot) -> str:
-    """Unit of torques over all joints: those of linear joints alone are forces."""
-    return "N" if len(linear_names(robot)) == robot.n else "N m"
+def torque_unit(robot: Robot, joints: Collection[str] = ()) -> str:
+    """Unit of torques over joints, all where none is said: those of linear joints are forces."""
+    units = units_of_torques(robot)
+    return " or ".join(sorted({units[j] for j in joints or units}, reverse=True))
+
+
+def units_of_torques(robot: Robot) -> dict[str, str]:
+    """Unit of its torque by joint."""
+    return dict(zip(robot.joint_names, torque_units(robot), strict=True))
 
 
 def unit_suffix(unit: str) -> str:

@@ -84,7 +84,7 @@ class JointGain:
 
 @dataclass(frozen=True)
 class Gain:
-    """Prediction error on held-out segments before and after, N m.
+    """Prediction error on held-out segments before and after, in the unit that ``metric`` ends with.
 
     ``joints``: those over which errors are taken; ``by_joint``: all, one by one.
     """

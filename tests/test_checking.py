@@ -278,3 +278,29 @@ def test_long_steps_of_every_period_are_no_lost_samples():
     gone = np.delete(slow, np.arange(150, 3800, 301), axis=0)
     short = replace(s, t=np.arange(len(gone)) / 200.0, tau=0.1 * gone, q=gone, period=1000, periods=4)
     assert "double steps" in lost_sample_warnings(short, among)[0]
+
+
+def test_a_channel_of_some_segments_is_told_as_such(clean):
+    data, _ = clean
+    link = np.full_like(data.segments[0].q, np.nan)
+    link[:, 1] = data.segments[0].q[:, 1]
+    first, *others = data.segments
+    report = inspect_dataset(replace(data, segments=(replace(first, q_link=link), *others)))
+    assert report.channels["q_link"] == (2,)
+    assert any(w.startswith(f"q_link of joint 2 in 1 of {len(data.segments)} segments only") for w in report.warnings)
+
+
+def test_what_no_model_is_fitted_to_and_what_no_gain_is_measured_by_is_told(clean):
+    data, _ = clean
+    motion = next(s for s in data.segments if s.kind == "trajectory")
+    fitted = [s for s in data.segments if s.role == "identification"]
+
+    def told(*segments):
+        return " ".join(inspect_dataset(replace(data, segments=segments)).warnings)
+
+    assert f"{motion.name} of role identification: nothing is fitted to motions beside multisines" in told(*fitted, replace(motion, role="identification"))
+    assert "beside multisines" not in told(*fitted, motion)
+    assert "leaving operating points out" in told(*fitted)
+    assert "no gain can be measured" in told(*(s for s in fitted if s.operating_point == fitted[0].operating_point))
+    assert "the end of the only motion will be held out" in told(replace(motion, role="identification"))
+    assert "excited_lines are not said" in told(*(replace(s, excited_lines=()) for s in fitted))

@@ -7,7 +7,7 @@ import pytest
 
 from ident.dataset import Dataset, Segment
 from ident.distortion import estimate_distortion
-from ident.frf import Blocks, _covariance, average, estimate_frf
+from ident.frf import Blocks, _covariance, average, estimate_frf, experiment_sets
 from ident.frf_basis import frf_levels
 from robot_assets.errors import DataError
 
@@ -225,3 +225,22 @@ def test_distortion_is_freed_of_what_the_loop_passes_on(ur10):
     torque = np.fft.rfft(data.segments[0].periodic("tau").mean(axis=0), axis=0, norm="forward")[even]
     raw = np.sqrt(np.mean(np.abs(torque) ** 2, axis=0))
     assert np.all(np.abs(raw / size - 1) > 0.2)
+
+
+def test_segments_that_do_not_say_which_they_are_are_all_used(clean):
+    """In sets of as many as there are joints; what is repeated, and what is beyond that number, makes sets of its own."""
+    data, _ = clean
+    point = [s for s in data.select(role="identification", kind="multisine") if s.amplitude == 1.0 and s.operating_point == "op01"]
+    numbers = [sorted(x) for x in experiment_sets(point, 6)]
+    assert numbers == [[1, 2, 3, 4, 5, 6]] * (len(point) // 6) and len(point) >= 6
+    unnumbered = [replace(s, experiment=None, realization=None) for s in point]
+    assert [list(x.values()) for x in experiment_sets(unnumbered * 2, 6)] == [unnumbered[:6]] * (2 * len(point) // 6)
+    assert len(experiment_sets([*point, *point], 6)) == 2 * len(point) // 6
+    assert [sorted(x) for x in experiment_sets(point[:6], 3)] == [[1, 2, 3]] * 2
+    assert [sorted(x) for x in experiment_sets(point[:4], 3)] == [[1, 2, 3], [1]]
+
+
+def test_multisines_without_excited_lines_are_refused_by_name(clean):
+    data, _ = clean
+    with pytest.raises(DataError, match="excited_lines: .*found none"):
+        estimate_frf(replace(data, segments=tuple(replace(s, excited_lines=()) for s in data.segments)))

@@ -38,7 +38,7 @@ def gains(of_excitation, at_random, rng):
     out = []
     for b, a in zip(*squares(DRAWS)):
         rows = Errors(("one",) * LINES, *(line_squares(x.reshape(-1, 1)) for x in (b, a, noise)))
-        out.append(measure_gain(rows, ("drive",), [0], "validation segments", rng))
+        out.append(measure_gain(rows, {"drive": "N m"}, [0], "validation segments", rng))
     return out, (before - after) / (before - floor)
 
 

@@ -129,8 +129,8 @@ def test_a_window_is_seen_as_the_transform_sees_it():
 
 def test_a_gain_of_some_joints_tells_of_all_of_them():
     before, after, noise = (np.array([[x, 16.0], [3.0 * x, 16.0]]) for x in (2.0, 0.5, 0.125))
-    gain = measure_gain(Errors(("a", "b"), before, after, noise), ("one", "two"), [0], "method", np.random.default_rng(0))
-    assert gain.joints == ("one",) and gain.of_some and gain.before == pytest.approx(2.0) and gain.after == pytest.approx(1.0)
+    gain = measure_gain(Errors(("a", "b"), before, after, noise), {"one": "N", "two": "N m"}, [0], "method", np.random.default_rng(0))
+    assert gain.joints == ("one",) and gain.metric.endswith(", N") and gain.of_some and gain.before == pytest.approx(2.0) and gain.after == pytest.approx(1.0)
     assert [(g.before, g.after) for g in gain.by_joint.values()] == [pytest.approx((2.0, 1.0)), pytest.approx((4.0, 4.0))]
     assert gain.over_all == pytest.approx((np.sqrt(10.0), np.sqrt(8.5)))
 

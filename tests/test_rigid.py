@@ -14,9 +14,10 @@ from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose_fully, with_inertias
 from ident.extended import predict
 from ident.graybox import Parameters
+from ident.held_out import with_held_out
 from ident.hypotheses import catalogue
 from ident.hypotheses.sensing import torque_offset
-from ident.identification import identify, set_up, with_held_out
+from ident.identification import identify, set_up
 from ident.model import Effect, Model
 from ident.parallel import Workers
 from ident.position_lines import wave_numbers

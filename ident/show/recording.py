@@ -106,7 +106,7 @@ def _markdown(diagnosis: Diagnosis) -> str:
         values = ", ".join(f"{k} = {rounded(x.value, x.std)}{unit_suffix(x.unit)}" for k, x in c.parameters.items())
         rows += [f"**{c.effect.replace('_', ' ')} at {c.joint}**, probability {c.probability:.3f}: {values}", "", c.evidence, ""]
     if v.gain is not None:
-        g, unit = v.gain, torque_unit(diagnosis.robot)
+        g, unit = v.gain, torque_unit(diagnosis.robot, v.gain.joints)
         interval = "" if g.ci95 is None else f" (95 % interval {g.ci95[0]:.1%} to {g.ci95[1]:.1%} of the gap closed)"
         rows.append(
             f"Torque error on held-out data {g.before:.3g} → {g.after:.3g} {unit}, noise {g.noise_floor:.3g} {unit}{interval}."

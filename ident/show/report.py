@@ -39,7 +39,7 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         unit=parameter_unit,
         rounded=rounded,
         unit_suffix=unit_suffix,
-        torque_unit=torque_unit(robot),
+        torque_unit=torque_unit(robot, of_gain),
         response_unit=response_unit(robot),
         table=parameter_table(diagnosis.verdict.baseline),
         grid=[(view.operating_point, frf_grid_figure(view, joints)) for view in _worst(diagnosis.frf)[:1]],

@@ -14,7 +14,8 @@ from ident.extended import predict
 from ident.gain import Errors, mean_squares, measure_gain
 from ident.graybox import parameter_names
 from ident.group import Group
-from ident.identification import identify, with_held_out
+from ident.held_out import with_held_out
+from ident.identification import identify
 from ident.model import Model
 from ident.output_noise import noise_covariance
 from ident.parallel import one_thread_each
@@ -22,10 +23,11 @@ from ident.problem import Problem, predictions
 from ident.reporting import affected_joints
 from ident.show.export import build_mjcf, note_record
 from ident.show.replay import load_arm, replay
+from ident.units import units_of_torques
 from ident.verdict import Gain
 from robot_assets.errors import DataError
 
-METRIC = "RMS error of the torque that the simulated motors need, N m"
+METRIC = "RMS error of the torque that the simulated motors need"
 SEGMENTS = 4  # of each operating point that are simulated
 
 
@@ -65,7 +67,7 @@ def simulated_gain(
         progress("simulation of both models")
     errors = simulated_errors(problem, groups, baseline.model, export_baseline(baseline.model), model)
     rng = np.random.default_rng(SEED)
-    return measure_gain(errors, dataset.joints, affected, "simulated in closed loop", rng, METRIC)
+    return measure_gain(errors, units_of_torques(problem.structure.robot), affected, "simulated in closed loop", rng, METRIC)
 
 
 def export_baseline(model: Model) -> mujoco.MjSpec:
