@@ -38,6 +38,8 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         sys.exit(_fail("interrupted"))
     except Exception as err:
+        if type(err).__name__ == "NoArgsIsHelpError":
+            sys.exit(_fail("no command: one of those above is expected"))
         if type(err).__module__.startswith(("click", "typer")):
             sys.exit(_fail(err.format_message() if hasattr(err, "format_message") else str(err)))
         raise
@@ -112,7 +114,7 @@ def experiment(
     """Run the closed-loop multisine experiment on the MuJoCo plant and write a dataset."""
     import numpy as np
 
-    from ident.dataset_io import save_dataset
+    from ident.dataset_io import check_target, save_dataset
     from ident.plan_file import plan_from_toml
     from sim import parse_effect, run_experiment
     from sim.experiment import draw_drives
@@ -125,6 +127,7 @@ def experiment(
     made = plan_from_toml(plan) if plan else _plan(arm, points, realizations, seed, (1.0, 0.5, 0.25))
     if made.robot.folder != arm.folder:
         raise DataError("--plan", str(plan), f"a plan for {made.robot.name}", f"one for {arm.name}")
+    _check_out(check_target(out))
     run = {"seed": seed, "drives": figures, "name": out.name}
     summary, text = {"dataset": str(out)}, ""
     with _progress(quiet or json_) as (_, share):
@@ -168,7 +171,9 @@ def frf(
     from ident.dataset_io import load_dataset
     from ident.frf_output import write_frf
 
-    summary = write_frf(load_dataset(dataset), out, estimator)
+    data = load_dataset(dataset)
+    _check_out(out)
+    summary = write_frf(data, out, estimator)
     _print(summary, json_, f"FRFs of {len(summary['operating_points'])} operating points in {out}")
 
 
@@ -186,6 +191,7 @@ def identify(
     from ident.identify_output import identify_and_write
 
     data = load_dataset(dataset)
+    _check_out(out)
     with _progress(quiet or json_) as (say, _):
         result = identify_and_write(data, out, estimator, say, frf)
     _print(result, json_, _parameter_table(result["parameters"]))
@@ -348,12 +354,13 @@ def convert(
 ) -> None:
     """Real logs (CSV, text, Parquet, MATLAB, NPZ, MCAP and rosbag2 with JointState) into the dataset format."""
     from ident.convert import convert_logs
-    from ident.dataset_io import save_dataset
+    from ident.dataset_io import check_target, save_dataset
 
     if guess:
         return _guess(files, robot, map_, json_, quiet)
     if out is None:
         raise DataError("--out", "command line", "no such option", "where to write the dataset, or --guess")
+    check_target(out)
     notes: list[str] = []
     with _progress(quiet or json_ or _soon_read(files)) as (say, _):
         data = convert_logs(files, robot, map_, name=out.name, say=notes.append, progress=say)

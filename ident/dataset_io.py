@@ -89,11 +89,11 @@ def match_joints(robot: Robot, joints: list[str], where: str) -> Robot:
     )
 
 
-def save_dataset(dataset: Dataset, path: str | Path) -> None:
-    """Write a dataset folder: beside the target first, then moved into place.
+def check_target(path: str | Path) -> Path:
+    """Where a dataset can be written, resolved.
 
     Raises:
-        DataError: where the target exists and holds anything that is no part of a dataset.
+        DataError: as of ``save_dataset``.
     """
     target = Path(path).resolve()
     if target.exists() and not target.is_dir():
@@ -101,6 +101,16 @@ def save_dataset(dataset: Dataset, path: str | Path) -> None:
     foreign = [p.name for p in target.iterdir() if not _of_dataset(p)] if target.is_dir() else []
     if foreign:
         raise DataError("output", str(path), f"{min(foreign)}, which is no part of a dataset", "a new folder or a dataset")
+    return target
+
+
+def save_dataset(dataset: Dataset, path: str | Path) -> None:
+    """Write a dataset folder: beside the target first, then moved into place.
+
+    Raises:
+        DataError: where the target exists and holds anything that is no part of a dataset.
+    """
+    target = check_target(path)
     for segment in dataset.segments:
         check_segment_name(segment.name, str(path))
     try:

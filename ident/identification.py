@@ -96,8 +96,8 @@ def runaways(dataset: Dataset) -> tuple[str, ...]:
 
 
 def moves(dataset: Dataset, q_std: np.ndarray) -> bool:
-    """Whether any joint moves beyond the noise of its position (n,) in any identification segment."""
-    return any(np.any(np.std(s.q, axis=0) > MOVES * q_std) for s in dataset.select(role="identification"))
+    """Whether any joint moves beyond the noise of its position (n,) in any segment."""
+    return any(np.any(np.std(s.q, axis=0) > MOVES * q_std) for s in dataset.segments)
 
 
 def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) -> float:

@@ -144,3 +144,21 @@ def test_the_search_ends_after_the_same_time_from_the_command_line_and_from_pyth
     from ident.diagnosis import MAX_SECONDS
 
     assert inspect.signature(command).parameters["max_seconds"].default == MAX_SECONDS
+
+
+@pytest.mark.parametrize("there", ["file", "folder", "below"])
+def test_an_output_that_cannot_be_is_refused_before_the_experiment_runs(tmp_path, monkeypatch, there):
+    from ident.cli import experiment
+    from robot_assets.errors import DataError
+
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "mine.txt").touch()
+    monkeypatch.setattr("sim.run_experiment", lambda *args, **rest: pytest.fail("run for nothing"))
+    with pytest.raises(DataError, match=r"found (a file|mine.txt|.*file, which is a file)"):
+        experiment("twomass", tmp_path / "file" / "d" if there == "below" else tmp_path / there, quiet=True)
+
+
+def test_no_command_is_one_line_beside_the_help():
+    run = simgap()
+    assert run.returncode == 2 and "no command" in run.stderr and "experiment" in run.stdout

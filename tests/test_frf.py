@@ -242,5 +242,5 @@ def test_segments_that_do_not_say_which_they_are_are_all_used(clean):
 
 def test_multisines_without_excited_lines_are_refused_by_name(clean):
     data, _ = clean
-    with pytest.raises(DataError, match="excited_lines: .*found none"):
+    with pytest.raises(DataError, match=r"excited_lines: .*found none"):
         estimate_frf(replace(data, segments=tuple(replace(s, excited_lines=()) for s in data.segments)))
