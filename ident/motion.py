@@ -108,6 +108,12 @@ class Motion:
         u = np.abs(self.torque(joint))
         return float(np.max(u if self.group.window is None else u[:, self.group.window > 0.0]))
 
+    def usual_torque(self, joint: int) -> float:
+        """Recorded motor torque that a motion exceeds half of the time, N m; without bounds where a motion repeats."""
+        if self.group.window is None:
+            return np.inf
+        return float(np.median(np.abs(self.torque(joint))[:, self.group.window > 0.0]))
+
     def asked(self, joint: int) -> np.ndarray:
         """Torque that the record leaves to a friction of the motor, N m."""
         if joint not in self.asked_of:

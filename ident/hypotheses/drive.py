@@ -113,12 +113,13 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
 
     An amplifier that limits by a controller of its own bends before it does: ``u (1 + |u / limit|^(1 / knee))^-knee``, which
     clips sharply where the knee is small, and takes 2 % at two thirds of the limit where it is largest. A limit near zero would deliver
-    nothing, and so explain any motor that hardly moves.
+    nothing, and so explain any motor that hardly moves. In a single motion a loop may wind up, and ask for many times what it gets; so it
+    does for less than half of the time.
     """
 
     def excess(limit: float, knee: float, motion: Motion, j: int) -> np.ndarray:
         u = motion.torque(j)
-        limit = max(limit, LEAST_LIMIT * motion.peak_torque(j))
+        limit = max(limit, min(LEAST_LIMIT * motion.peak_torque(j), motion.usual_torque(j)))
         over = np.log(np.maximum(np.abs(u), 1e-12 * limit) / limit) / knee
         return u * (1.0 - np.exp(-knee * np.logaddexp(0.0, over)))
 
@@ -129,7 +130,7 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
         "drive",
         (Parameter("limit", "N m", 1e-6, 1e8, log=True, step=1e-3), KNEE),
         lambda p, motion, j, k, U: U + motion.lines(excess(*p, motion, j)),
-        lambda scale: [(f * scale.peak_torque, KNEE.center) for f in (0.5, 0.65, 0.8, 0.9, 0.96)],
+        lambda scale: [(f * scale.peak_torque, KNEE.center) for f in (0.12, 0.3, 0.5, 0.65, 0.8, 0.9, 0.96)],
         lambda motion, j, k, shape: Screen(
             (excess(*shape, motion, j),), lambda c: np.array(shape) if c[0] > 0.2 else None, shape
         ),
