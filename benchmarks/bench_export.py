@@ -24,6 +24,7 @@ from ident.problem import Problem
 from ident.show.export import NATIVE, build_mjcf, note_record
 from ident.show.simulated_gain import export_baseline, simulated_errors, spread
 from ident.torque_fit import Fit, fit
+from ident.units import units_of_torques
 from ident.verdict import Cause, Gain
 from robot_assets.robot import Robot, load_robot
 from sim import draw_effect, run_experiment
@@ -85,7 +86,7 @@ def both_gains(dataset: Dataset, effect, segments: int = 2) -> tuple[Gain, Gain]
     excess = (predicted.before - predicted.noise).sum(axis=0)
     affected = np.flatnonzero(excess >= 0.1 * excess.sum())
     rng = np.random.default_rng(0)
-    return tuple(measure_gain(e, dataset.joints, affected, "", rng) for e in (predicted, simulated))
+    return tuple(measure_gain(e, units_of_torques(dataset.robot), affected, "", rng) for e in (predicted, simulated))
 
 
 def main() -> None:

@@ -375,6 +375,7 @@ def test_a_dead_band_is_screened_where_gravity_has_led_the_gear_through_it(ident
     assert first.hypothesis is h and first.start == pytest.approx([gap, 0.0], rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_cause_begins_beside_the_drives_that_have_taken_its_place(identified, named):
     """A gear that hardly yields looks like a stiffer one: with the cause beside that, the gear would be stiff twice."""
     _, setup, result = identified
@@ -558,6 +559,7 @@ def test_a_motor_that_friction_holds_altogether_is_said_not_to_move(tmp_path):
         diagnose(through_files(data, tmp_path))
 
 
+@pytest.mark.slow
 def test_an_offset_of_a_torque_record_is_no_spring(clean, tmp_path):
     """A spring whose rest is far away pulls with a constant torque."""
     data, _ = clean
@@ -837,6 +839,7 @@ def test_a_cause_meets_those_that_are_hard_to_tell_from_it_though_its_round_has_
     assert alike(replace(found, scores=unphysical), heavy) == [] == alike(found, named["dress_pack", "elbow_joint"])
 
 
+@pytest.mark.slow
 def test_a_search_tries_other_bodies_where_one_answers_best(ur10, named, tmp_path):
     """Of the links that could make up for a wrist that is too heavy more than two are refitted."""
     heavy = parse_effect("link_inertia@wrist_1_link:mass=1.2", ur10)
