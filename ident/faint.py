@@ -59,7 +59,8 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
     """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
 
     None of motions, nor beside link encoders, of which the weights follow what the model leaves. None where periods drift, at
-    that joint or of the whole chain: a few numbers explain much of such noise. None at the joint of a law along the record, which turns noise into a signal of its own there.
+    that joint or of the whole chain: a few numbers explain much of such noise. None at the joint of a law along the record,
+    which turns noise into a signal of its own there.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.
