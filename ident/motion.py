@@ -104,9 +104,17 @@ class Motion:
         return self._time(self.group.U, joint, share=self.group.torque_share[..., joint])
 
     def peak_torque(self, joint: int) -> float:
-        """Largest recorded motor torque, N m; the return that closes a motion was not recorded."""
+        """Largest recorded motor torque, N m."""
+        return float(np.max(self.torque_sizes(joint)))
+
+    def usual_torque(self, joint: int) -> float:
+        """Recorded motor torque that is exceeded half of the time, N m."""
+        return float(np.median(self.torque_sizes(joint)))
+
+    def torque_sizes(self, joint: int) -> np.ndarray:
+        """Sizes of the recorded motor torque, N m; the return that closes a motion was not recorded."""
         u = np.abs(self.torque(joint))
-        return float(np.max(u if self.group.window is None else u[:, self.group.window > 0.0]))
+        return u if self.group.window is None else u[:, self.group.window > 0.0]
 
     def asked(self, joint: int) -> np.ndarray:
         """Torque that the record leaves to a friction of the motor, N m."""

@@ -32,6 +32,7 @@ from ident.evidence import (
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
 from ident.hypotheses.bodies import payload, payload_like
+from ident.hypotheses.drive import torque_saturation
 from ident.hypotheses.hinges import hinge_inertia
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
@@ -531,6 +532,17 @@ def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
     rough = np.random.default_rng(0).normal(size=smooth.shape)
     noisy = replace(segment, tau=segment.tau + rough)
     assert _noise(replace(data, segments=(noisy,), q_std=None, tau_std=None))[1] == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("wound_up", "limit"), [(False, 12.0), (True, 3.0)])
+def test_a_limit_far_below_the_peaks_is_one_that_a_loop_winds_up_against(wound_up, limit):
+    """In motions that exceed it now and then; elsewhere it would explain any motor that friction holds."""
+    h, u = torque_saturation(2, "elbow_joint", wound_up), 20.0 * np.linspace(-2.0, 2.0, 401)
+    motion = SimpleNamespace(torque=lambda j: u, peak_torque=lambda j: 40.0, usual_torque=lambda j: 3.0, lines=lambda x: x)
+    taken = h.law(np.array([1.0, 2e-3]), motion, 2, 1.0, 0.0)
+    assert np.abs(u - taken).max() == pytest.approx(limit, rel=1e-2)
+    starts = [[x for x, _ in h.shapes(SimpleNamespace(peak_torque=40.0, exceeded_torque=low))] for low in (5.0, 11.0, np.inf)]
+    assert starts == ([[5.0, 7.0], [], []] if wound_up else [[20.0, 26.0, 32.0, 36.0, 38.4]] * 3)
 
 
 def test_a_motor_that_creeps_in_its_friction_is_no_drive_that_saturates(tmp_path):

@@ -48,6 +48,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     out: list[Hypothesis] = []
     linear = linear_joints(robot)
     for j, name in enumerate(names):
+        out.append(drive.torque_saturation(j, name, wound_up=True))
         out += [make(j, name) for make in PER_JOINT]
         if not linear[j]:  # what errs once a turn
             out.append(sensing.encoder_eccentricity(j, name))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.ripple import SECOND, ripple
 from ident.motion import Motion
 
@@ -108,19 +108,29 @@ def torque_delay(joint: int, place: str) -> Hypothesis:
     )
 
 
-def torque_saturation(joint: int, place: str) -> Hypothesis:
+def torque_saturation(joint: int, place: str, wound_up: bool = False) -> Hypothesis:
     """Delivered torque is clipped at ``limit``, which takes no more than the peaks.
 
     An amplifier that limits by a controller of its own bends before it does: ``u (1 + |u / limit|^(1 / knee))^-knee``, which
     clips sharply where the knee is small, and takes 2 % at two thirds of the limit where it is largest. A limit near zero would deliver
     nothing, and so explain any motor that hardly moves.
+
+    Args:
+        wound_up: whether the loop asks for many times what it gets in single motions: for a fifth of all that was recorded, and for half of
+            a motion, at most.
     """
 
     def excess(limit: float, knee: float, motion: Motion, j: int) -> np.ndarray:
         u = motion.torque(j)
-        limit = max(limit, LEAST_LIMIT * motion.peak_torque(j))
+        limit = max(limit, motion.usual_torque(j) if wound_up else LEAST_LIMIT * motion.peak_torque(j))
         over = np.log(np.maximum(np.abs(u), 1e-12 * limit) / limit) / knee
         return u * (1.0 - np.exp(-knee * np.logaddexp(0.0, over)))
+
+    def shapes(scale: SignalScale) -> list[tuple[float, float]]:
+        if not wound_up:
+            return [(f * scale.peak_torque, KNEE.center) for f in (0.5, 0.65, 0.8, 0.9, 0.96)]
+        low = scale.exceeded_torque
+        return [(f * low, KNEE.center) for f in (1.0, 1.4)] if 1.4 * low < LEAST_LIMIT * scale.peak_torque else []
 
     return Hypothesis(
         "torque_saturation",
@@ -129,7 +139,7 @@ def torque_saturation(joint: int, place: str) -> Hypothesis:
         "drive",
         (Parameter("limit", "N m", 1e-6, 1e8, log=True, step=1e-3), KNEE),
         lambda p, motion, j, k, U: U + motion.lines(excess(*p, motion, j)),
-        lambda scale: [(f * scale.peak_torque, KNEE.center) for f in (0.5, 0.65, 0.8, 0.9, 0.96)],
+        shapes,
         lambda motion, j, k, shape: Screen(
             (excess(*shape, motion, j),), lambda c: np.array(shape) if c[0] > 0.2 else None, shape
         ),
