@@ -13,6 +13,7 @@ from ident.model import Model
 from ident.output_noise import noise_covariance
 from ident.problem import Problem
 from ident.stiction import as_held, held_share
+from ident.units import common_unit
 from ident.verdict import Gain, JointGain
 
 METRIC = "RMS motor-torque prediction error"
@@ -143,5 +144,5 @@ def measure_gain(
         ratio = (b - a) / np.maximum(b - f, 1e-300)
         interval = tuple(float(v) for v in np.quantile(ratio, [0.025, 0.975]))
     told, of = tuple(dict.fromkeys(errors.segments)), tuple(list(joints)[j] for j in pick_joints)
-    unit = " or ".join(sorted({joints[name] for name in of}, reverse=True))
+    unit = common_unit(joints[name] for name in of)
     return Gain(told, f"{metric}, {unit}", before, after, noise, closed, interval, method, of, by_joint)

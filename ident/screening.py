@@ -53,7 +53,7 @@ def signal_scale(
     problem: Problem, predictions: Sequence[Prediction], joint: int, wave_numbers: tuple[float, ...]
 ) -> SignalScale:
     """Sizes of a joint's signals over all records."""
-    v, q, delta, torque, res, peak, sizes = [], [], [], [], [], [], []
+    v, q, delta, torque, res, sizes = [], [], [], [], [], []
     starts, tops = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
         motion = pred.motion(group)
@@ -63,13 +63,12 @@ def signal_scale(
         delta.append(np.abs(motion.delta(joint)).ravel()[::7])
         u = motion.torque(joint)
         torque.append(np.mean((u - u.mean(axis=1, keepdims=True)) ** 2))
-        peak.append(motion.peak_torque(joint))
         sizes.append(motion.torque_sizes(joint).ravel())
         r = group.to_time((group.U - pred.U)[..., joint : joint + 1])
         res.append(np.mean(r**2))
         starts += [*group.start, *(group.start + group.period_time)]
         tops.append(group.omega[group.n_compared - 1] / 2 / np.pi)
-    all_delta = np.concatenate(delta)
+    all_delta, all_sizes = np.concatenate(delta), np.concatenate(sizes)
     return SignalScale(
         v=float(np.sqrt(np.mean(v))),
         q=float(np.sqrt(np.mean(q))),
@@ -79,8 +78,8 @@ def signal_scale(
         residual=float(np.sqrt(np.mean(res))),
         stiffness=float(predictions[0].par.stiffness[joint]),
         wave_numbers=wave_numbers,
-        peak_torque=float(max(peak)),
-        exceeded_torque=np.inf if any(g.window is None for g in problem.groups) else float(np.quantile(np.concatenate(sizes), 0.8)),
+        peak_torque=float(np.max(all_sizes)),
+        exceeded_torque=np.inf if any(g.window is None for g in problem.groups) else float(np.quantile(all_sizes, 0.8)),
         duration=float(max(starts) - min(starts)) if len(set(np.round(starts, 3))) > 2 else 0.0,
         highest_line=float(np.median(tops)),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from ident.chain import INERTIAL
 from robot_assets.robot import Robot, linear_joints
@@ -74,7 +74,12 @@ def response_unit(robot: Robot) -> str:
 def torque_unit(robot: Robot, joints: Collection[str] = ()) -> str:
     """Unit of torques over joints, all where none is said: those of linear joints are forces."""
     units = units_of_torques(robot)
-    return " or ".join(sorted({units[j] for j in joints or units}, reverse=True))
+    return common_unit(units[j] for j in joints or units)
+
+
+def common_unit(units: Iterable[str]) -> str:
+    """One unit for quantities of several, those of rotary joints first: "N m or N" where they differ."""
+    return " or ".join(sorted(set(units), reverse=True))
 
 
 def units_of_torques(robot: Robot) -> dict[str, str]:

@@ -327,6 +327,7 @@ def test_held_out_data_deny_a_faint_cause_that_does_not_show_there(identified, h
     found = Round(before, (Candidate(h, after, 0.0, 1.0),), (), 1.0, 1.0)
     assert any(g.window is None for g in setup.held_out)
     assert denied(setup.problem, setup.held_out, found) == expected
+    assert denied(setup.problem, tuple(single(g) for g in setup.held_out), found) == expected
     motions = tuple(g for g in setup.held_out if g.window is not None)
     assert not denied(setup.problem, motions, found)
     assert not denied(setup.problem, setup.held_out, replace(found, before=replace(before, costs=10.0 * before.costs)))

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 
 from ident.chain import build_structure
 from ident.show.figures import frf_picture, rounded
-from ident.units import response_unit, torque_unit, torque_units, unit_suffix
+from ident.units import response_unit, torque_unit, unit_suffix, units_of_torques
 from ident.verdict import Diagnosis, TorqueTrace
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
@@ -53,7 +53,7 @@ def write_recording(diagnosis: Diagnosis, path: Path) -> None:
 
 def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     joints = _worst_joints(diagnosis)
-    unit = dict(zip(diagnosis.joints, torque_units(diagnosis.robot), strict=True))
+    unit = units_of_torques(diagnosis.robot)
     torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, {unit[joints[0]]}")]
     torques += [rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, {unit[name]}") for name in joints]
     responses = [
