@@ -104,10 +104,10 @@ def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) 
     """Highest compared frequency of motions, Hz: below the modes of the links on standing motors.
 
     Near such a mode the torque depends on how the links swung before the record began, which no
-    record of the motors tells. One band serves all motions: of held-out ones it asks where they go, not what was measured there.
+    record of the motors tells. Held-out motions say nothing of it but where there are no others.
     """
     lowest = np.inf
-    for segment in dataset.select(kind="trajectory"):
+    for segment in dataset.select(role="identification", kind="trajectory") or dataset.select(kind="trajectory"):
         for q in segment.q[:: max(1, len(segment.q) // POSTURES)]:
             lin = linearise(structure, equilibrium(structure, nominal, q))
             K = np.diag(stiffness_diagonal(structure, nominal)) + lin.Kg
