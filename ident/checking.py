@@ -64,9 +64,11 @@ class Report:
     files: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
+        """The report as JSON holds it."""
         return asdict(self)
 
     def text(self) -> str:
+        """The report as the command line prints it."""
         kinds = ", ".join(f"{v} {k}" for k, v in self.segments.items())
         n = len(self.joints)
         hold = "held over a sample" if self.hold == "zoh" else "band-limited or unknown between samples"

@@ -64,6 +64,7 @@ class Segment:
 
     @property
     def n_samples(self) -> int:
+        """Samples of the record."""
         return len(self.t)
 
     def part(self, rows: slice) -> dict[str, np.ndarray]:
@@ -107,6 +108,7 @@ class Dataset:
 
     @property
     def n(self) -> int:
+        """Joints."""
         return len(self.joints)
 
     def select(self, *, role: str | None = None, kind: str | None = None) -> tuple[Segment, ...]:

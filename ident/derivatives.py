@@ -263,6 +263,11 @@ def jacobians(problem: Problem, model: Model, preds: Sequence[Prediction], *, ex
 def normal_equations(
     problem: Problem, columns: Sequence[Columns], preds: Sequence[Prediction], weights: Weights
 ) -> tuple[np.ndarray, np.ndarray]:
+    """``J^T J`` (p, p) and ``J^T r`` (p,) of the whitened residual, summed over groups.
+
+    Args:
+        columns: derivatives of the outputs of each group by the coordinates of the fit.
+    """
     def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
         group = problem.groups[g]
         error = output_error(group, preds[g])

@@ -37,6 +37,7 @@ class Prediction:
     added_stiffness: np.ndarray
 
     def motion(self, group: Group) -> Motion:
+        """The predicted motion in time, with the torque that its drives deliver."""
         drives = [e for e in self.model.effects if e.hypothesis.channel == "drive"]
         told = joints_along_record(self.model, group)
         return Motion(group, self.solution, self.par, delivered=delivered(drives, group, self.plane), told=told)

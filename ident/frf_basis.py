@@ -87,6 +87,11 @@ def sample_noise_power(dataset: Dataset, period: int, frequency: np.ndarray) -> 
 
 
 def common_lines(segments: list[Segment], dataset: Dataset) -> np.ndarray:
+    """Excited lines that all segments share; (F,) int, sorted.
+
+    Raises:
+        DataError: where periods differ or no line is shared.
+    """
     first = segments[0]
     lines = np.asarray(first.excited_lines, int)
     for s in segments:

@@ -21,6 +21,7 @@ class Effect:
     p: np.ndarray
 
     def value(self, name: str) -> float:
+        """A parameter by its name, SI."""
         return float(self.p[[q.name for q in self.hypothesis.parameters].index(name)])
 
 

@@ -74,6 +74,7 @@ class Workers:
 
     @property
     def late(self) -> bool:
+        """Whether the time is used up."""
         return time.monotonic() > self.deadline
 
     def for_half(self) -> Workers:
@@ -82,6 +83,7 @@ class Workers:
         return replace(self, deadline=now + 0.5 * max(self.deadline - now, 0.0))
 
     def say(self, text: str) -> None:
+        """Tell whoever asked for progress."""
         if self.progress is not None:
             self.progress(text)
 

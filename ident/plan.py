@@ -237,5 +237,10 @@ def point_to_point(robot: Robot, a: np.ndarray, b: np.ndarray, rate: float) -> n
 
 
 def check_size(samples: int, robot: Robot, where: str) -> None:
+    """Refuse a record that would not fit into memory.
+
+    Raises:
+        DataError: where ``samples`` of all joints are more than ``MOST_NUMBERS``.
+    """
     if samples * robot.n > MOST_NUMBERS:
         raise DataError("plan", where, f"{samples:.3g} samples of {robot.n} joints", f"at most {MOST_NUMBERS:g} numbers")

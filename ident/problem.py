@@ -44,9 +44,11 @@ class Problem:
 
     @property
     def motions_alone(self) -> bool:
+        """Whether no record is periodic."""
         return all(group.window is not None for group in self.groups)
 
     def samples(self, group: Group) -> int:
+        """Samples of a period of a group, or of the whole of a motion."""
         return round(group.period_time / self.sampling.sample_time)
 
 

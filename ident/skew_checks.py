@@ -38,6 +38,7 @@ class Skew:
 
     @property
     def sure(self) -> bool:
+        """Whether the shift is beyond the error of its estimate."""
         return bool(np.isfinite(self.late) and abs(self.late) > SURE * self.std)
 
 

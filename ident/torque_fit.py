@@ -81,14 +81,17 @@ class Fit:
 
     @property
     def cost(self) -> float:
+        """Sum of squares of the whitened residual."""
         return float(np.sum(self.costs))
 
     @property
     def count(self) -> int:
+        """Real numbers that are compared."""
         return int(np.sum(self.counts))
 
     @property
     def chi2_per_dof(self) -> float:
+        """Cost over degrees of freedom: 1 where noise alone is left."""
         return self.cost / max(self.count - len(self.names), 1)
 
     def covariance(self) -> np.ndarray:

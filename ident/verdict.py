@@ -30,6 +30,8 @@ class Value:
 
 @dataclass(frozen=True)
 class Alternative:
+    """A rival of a named cause."""
+
     effect: str
     joint: str
     probability: float
@@ -67,6 +69,8 @@ class Where:
 
 @dataclass(frozen=True)
 class Discrepancy:
+    """Whether the first model differs from the data beyond noise, and at which joints and frequencies."""
+
     detected: bool
     p_value: float
     chi2_per_dof: float

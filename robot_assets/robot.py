@@ -91,10 +91,12 @@ class Robot:
 
     @property
     def n(self) -> int:
+        """Joints."""
         return len(self.joints)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, from the base on."""
         return tuple(j.name for j in self.joints)
 
     def array(self, field: str) -> np.ndarray:

@@ -30,6 +30,7 @@ def render(
     linear: np.ndarray,
     doubts: Mapping[str, str],
 ) -> str:
+    """A map file in TOML, with what was guessed, why, and what is to be edited."""
     lines = [
         f"# First map of {plain(paths[0].name)} for the robot {plain(arm.name)}: guessed, so check every line,",
         "# above all those marked EDIT. Result: tau in N m (N), q in rad (m), both on the link side of the gear.",
@@ -135,8 +136,10 @@ def period_of(chosen: dict[str, Family]) -> int | None:
 
 
 def plain(text: str) -> str:
+    """Text of a log as it may stand in a comment: one line without control characters."""
     return "".join(ch if ch.isprintable() else " " for ch in text)[:120]
 
 
 def quoted(text: str) -> str:
+    """A string of TOML."""
     return tomlkit.item(text).as_string()

@@ -47,6 +47,7 @@ class FoundTime:
 
     @property
     def sources(self) -> set[str]:
+        """Signals of the log that make up the time."""
         return {s for s in (self.source, *(p[0] for p in self.plus)) if s is not None}
 
 

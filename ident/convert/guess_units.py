@@ -53,6 +53,7 @@ class Family:
     wraps: bool = False
 
     def has(self, vocabulary: Sequence[str]) -> bool:
+        """Whether a word of its name is one of the vocabulary, or begins with one of more than two letters."""
         return any(w in vocabulary or any(len(v) > 2 and w.startswith(v) for v in vocabulary) for w in self.words)
 
 
@@ -67,6 +68,13 @@ class Scale:
 
 
 def guess_scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate: float | None) -> dict[str, Scale]:
+    """Units, sides of the gear and signs of the channels, from their names and from the sizes of their samples.
+
+    Args:
+        chosen: columns of each channel.
+        linear: (n,) whether a joint is prismatic.
+        rate: samples per second, where it is known: velocities are compared with differences of positions.
+    """
     out: dict[str, Scale] = {}
     velocity = None
     # A drive that reports torque before the gear mostly reports its position there too.
@@ -264,4 +272,5 @@ def _options(unit: str, side: str, sign: int = 1) -> tuple[str, ...]:
 
 
 def range_text(x: np.ndarray) -> str:
+    """Least and greatest sample, for a comment in a map."""
     return f"{x.min():.3g} to {x.max():.3g}"

@@ -52,6 +52,7 @@ class Column:
 
     @property
     def sources(self) -> tuple[str, ...]:
+        """Signals of the log that make up the column."""
         return (self.source, *(p[0] for p in self.plus))
 
 

@@ -51,10 +51,12 @@ class Parameter:
         return self.to_internal(self.center * stiffness if self.per_stiffness else self.center)
 
     def to_internal(self, value: float) -> float:
+        """Coordinate of the fit: clipped to the bounds, the logarithm where ``log``."""
         value = float(np.clip(value, self.lower, self.upper))
         return float(np.log(value)) if self.log else value
 
     def to_external(self, x: float) -> float:
+        """Value in SI of a coordinate of the fit, within the bounds."""
         value = float(np.exp(np.clip(x, -700, 700))) if self.log else x
         return float(np.clip(value, self.lower, self.upper))
 
@@ -149,6 +151,7 @@ class Hypothesis:
 
     @property
     def decoy(self) -> bool:
+        """Whether it stands for what the catalogue lacks."""
         return self.effect.startswith("unknown:")
 
     @property
@@ -158,6 +161,7 @@ class Hypothesis:
 
     @property
     def key(self) -> tuple[str, str]:
+        """Effect and place."""
         return self.effect, self.place
 
     def coordinate(self, parameter: str) -> str:
