@@ -15,7 +15,7 @@ from ident.chain import build_structure
 from ident.conclude import conclude, named_effects
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
-from ident.gain import Errors, measure_gain, segment_errors
+from ident.gain import Errors, measure_gain, ratio_interval, segment_errors
 from ident.graybox import Parameters
 from ident.group import Group
 from ident.held_out import not_fitted, with_held_out
@@ -36,7 +36,7 @@ from ident.units import torque_unit, units_of_torques
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 
 LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
-SETTLED_BY_INERTIAS = 0.7  # chi2 with the links' inertias found, over that without, that is worth them; geometric mean over joints
+SETTLED_BY_INERTIAS = 0.7  # chi2 with the links' inertias found, over that without, that is worth them by itself; geometric mean over joints
 CARRIED_OVER = 0.9  # squares of the torque left with inertias found, over those with inertias described, on parts left out, that are worth them
 MAX_SECONDS = 600.0  # of search for causes
 SEED = 0
@@ -124,6 +124,8 @@ def diagnose_fully(
         notes.append(f"Not among the held-out data: {names}. Torques above {RUNAWAY:g} times those of the others say that the loop was lost.")
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
+    if rigid is not None and setup.held_out:
+        notes.append("Held-out motions took part in the choice between these inertias and those of the description.")
     notes += [f"Not used: {line}." for line in not_fitted(given)]
     if gain is None and not setup.held_out:
         notes.append("No gain is measured: nothing is held out, and of a single operating point nothing can be left out.")
@@ -277,9 +279,28 @@ def with_inertias(
     if left_over(baseline, result.baseline) > 1.0:  # no better to begin with than the links of the description
         return setup, result, None
     other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
-    if left_over(other.final, result.final) > SETTLED_BY_INERTIAS:
+    if not worth_it(left_over(other.final, result.final), foretold(setup, result.final, other.final)):
         return setup, result, None
     return replace(setup, problem=problem), other, rigid
+
+
+def worth_it(left: float, held_out: tuple[float, float]) -> bool:
+    """Whether inertias found are kept, by what they leave over what is left without.
+
+    Args:
+        left: of the motions that were fitted (``left_over``). Both sides have causes of their own, sought apart, which makes this rough.
+        held_out: interval of the same on held-out motions (``foretold``).
+    """
+    least, most = held_out
+    return least <= 1.0 and (left <= SETTLED_BY_INERTIAS or (left <= 1.0 and most < 1.0))
+
+
+def foretold(setup: Setup, one: Fit, other: Fit) -> tuple[float, float]:
+    """Interval of what ``other`` leaves of held-out motions over what ``one`` leaves there (``ratio_interval``); (0, inf) where none are held out."""
+    if not setup.held_out:
+        return 0.0, np.inf
+    errors, _ = segment_errors(setup.problem, setup.held_out, one.model, other.model)
+    return ratio_interval(errors, np.random.default_rng(SEED))
 
 
 def left_over(one: Fit, other: Fit) -> float:

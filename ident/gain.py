@@ -146,3 +146,17 @@ def measure_gain(
     told, of = tuple(dict.fromkeys(errors.segments)), tuple(list(joints)[j] for j in pick_joints)
     unit = common_unit(joints[name] for name in of)
     return Gain(told, f"{metric}, {unit}", before, after, noise, closed, interval, method, of, by_joint)
+
+
+def ratio_interval(errors: Errors, rng: np.random.Generator) -> tuple[float, float]:
+    """95 % interval of the squares left after, over those left before, at each joint no less than noise; geometric mean over the joints.
+
+    A percentile bootstrap over the rows of ``errors``; (0, inf) where there are too few for one.
+    """
+    if len(errors.segments) < 2:
+        return 0.0, np.inf
+    pick = rng.integers(len(errors.segments), size=(RESAMPLES, len(errors.segments)))
+    before, after, noise = (x[pick].mean(axis=1) for x in (errors.before, errors.after, errors.noise))
+    logs = np.log(np.maximum(after, noise)) - np.log(np.maximum(before, noise))
+    low, high = np.quantile(np.exp(logs.mean(axis=1)), [0.025, 0.975])
+    return float(low), float(high)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ident.attribute import Attribution
 from ident.chain import LinkChange, build_structure
 from ident.dataset import Dataset, Segment
-from ident.diagnosis import diagnose_fully, with_inertias
+from ident.diagnosis import diagnose_fully, foretold, with_inertias, worth_it
 from ident.extended import predict
 from ident.graybox import Parameters
 from ident.held_out import with_held_out
@@ -202,6 +202,35 @@ def test_inertias_that_do_worse_than_the_description_are_left_at_once(moved, mon
     monkeypatch.setattr("ident.diagnosis.attribute", lambda *args, **kwargs: asked.append(args[1]) or found)
     assert with_inertias(setup, found, 1, Workers()) == (setup, found, None)
     assert asked == [worse] * sought
+
+
+@pytest.mark.parametrize(
+    ("left", "held_out", "kept"),
+    [
+        (0.5, (0.0, np.inf), True),  # nothing is held out
+        (0.8, (0.0, np.inf), False),
+        (0.8, (0.6, 0.9), True),  # held-out motions are surely better with them
+        (0.8, (0.6, 1.1), False),
+        (0.5, (0.6, 1.1), True),
+        (0.5, (1.1, 1.3), False),  # surely worse
+        (1.1, (0.6, 0.9), False),
+    ],
+)
+def test_inertias_are_kept_by_what_they_leave_of_fitted_and_of_held_out_motions(left, held_out, kept):
+    assert worth_it(left, held_out) is kept
+
+
+def test_held_out_motions_say_whether_inertias_found_foretell(moved, ur10):
+    """Bodies as they are against bodies as described, which here they are not; and the other way round."""
+    setup, first = identify(moved)
+    structure = build_structure(ur10, links=CHANGED)
+    right = replace(first, model=replace(first.model, structure=structure))
+    assert setup.held_out
+    least, most = foretold(setup, first, right)
+    assert 0.0 < least < most < 1.0  # friction is left to both
+    back = foretold(setup, right, first)
+    assert back == pytest.approx((1.0 / most, 1.0 / least), rel=0.2)
+    assert foretold(replace(setup, held_out=()), first, right) == (0.0, np.inf)
 
 
 def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
