@@ -174,7 +174,9 @@ def frf(
     data = load_dataset(dataset)
     _check_out(out)
     summary = write_frf(data, out, estimator)
-    _print(summary, json_, f"FRFs of {len(summary['operating_points'])} operating points in {out}")
+    spare = summary["not_used"]
+    without = f"; not used: {len(spare)} segments in sets of fewer experiments than inputs, {spare[0]} first" if spare else ""
+    _print(summary, json_, f"FRFs of {len(summary['operating_points'])} operating points in {out}{without}")
 
 
 @app.command()

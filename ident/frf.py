@@ -91,6 +91,7 @@ def estimate_frf(
         realizations=min(b.U.shape[0] for b in blocks),
         periods=min(b.U.shape[1] for b in blocks),
         estimator=kind,
+        not_used=tuple(s.name for members in points.values() for x in experiment_sets(members, n) if len(x) < n for s in x.values()),
     )
 
 

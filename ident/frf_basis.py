@@ -28,6 +28,7 @@ class FRF:
         operating_points: names. q0: (Q, n) rad, mean motor position.
         amplitude: relative level. realizations, periods: averaged; the fewest of all points.
         estimator: of ``ESTIMATORS`` or ``LOCAL``.
+        not_used: segments of that level in sets of fewer than n experiments, beside sets that are complete.
     """
 
     G: np.ndarray
@@ -42,6 +43,7 @@ class FRF:
     realizations: int
     periods: int
     estimator: str
+    not_used: tuple[str, ...] = ()
 
 
 def frf_levels(dataset: Dataset, *, role: str = "identification") -> tuple[float, ...]:

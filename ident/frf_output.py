@@ -30,6 +30,7 @@ def write_frf(dataset: Dataset, out: str | Path, estimator: str = "auto") -> dic
         "band_hz": [float(frf.frequency[0]), float(frf.frequency[-1])],
         "realizations": frf.realizations,
         "periods": frf.periods,
+        "not_used": list(frf.not_used),
         "median_relative_std": float(np.median(frf.total_std / magnitude)),
         "distortion_N_m": {
             kind: {

@@ -213,7 +213,11 @@ def test_equal_experiments_are_refused(ur10):
 
 
 def test_an_incomplete_realization_is_left_out(ur10):
-    assert estimate_frf(recorded(ur10, 2, M=3, skip={(2, 1)})[0]).realizations == 2
+    data, _ = recorded(ur10, 2, M=3, skip={(2, 1)})
+    frf = estimate_frf(data)
+    assert frf.realizations == 2
+    alone = [s.name for s in data.segments if s.name in frf.not_used]
+    assert len(alone) == len(frf.not_used) == 1 and estimate_frf(recorded(ur10, 2, M=3)[0]).not_used == ()
 
 
 def test_distortion_is_freed_of_what_the_loop_passes_on(ur10):
