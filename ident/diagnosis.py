@@ -86,15 +86,18 @@ def diagnose_fully(
     setup, baseline = identify(dataset, progress=say)
     recorded = setup.problem.groups
     linked = None if doubts else by_link_encoders(dataset, setup, baseline, max_causes, workers)
+    foretell = not doubts and setup.problem.motions_alone and inertias_foretell(setup)
+    first_search = workers.for_half() if foretell else workers  # causes are then sought beside these inertias too
     if linked is None or not explained(linked[-1]):
-        setup, baseline, result = sought(dataset, setup, baseline, max_causes, workers)
+        setup, baseline, result = sought(dataset, setup, baseline, max_causes, first_search)
         linked = linked if linked is not None and linked[-1].detected and not result.detected else None
     if linked is not None:
         setup, recorded, baseline, result = linked
-    nominal, rigid = setup.problem.nominal, None
-    if linked is None and unresolved(result) and not doubts and not workers.late and setup.problem.motions_alone:
+    nominal, rigid, cut = setup.problem.nominal, None, first_search.late
+    if linked is None and unresolved(result) and foretell and not workers.late:
         setup, result, rigid = with_inertias(setup, result, max_causes, workers)
-    problem, cut = setup.problem, workers.late
+        cut = workers.late or (cut and rigid is None)
+    problem = setup.problem
     say("gain on held-out data")
     first = predictions(problem, baseline.model, baseline.remainders)
     affected = affected_joints(problem, baseline, first) if result.detected else ()
@@ -263,13 +266,11 @@ def with_inertias(
     """Causes sought anew with inertias of the links and offsets of the torque found from motions, where that explains far more.
 
     The links of a real arm are not those of its description, torque records have offsets, and friction is
-    judged wrongly beside both. Short motions fit well with other inertias that foretell nothing: parts of them left out say so.
+    judged wrongly beside both.
     """
     workers.say("inertias of the links")
     problem = setup.problem
     try:
-        if carried_over(problem.structure, problem.nominal, problem.groups) > CARRIED_OVER:
-            return setup, result, None
         rigid = fit_rigid(problem.structure, problem.nominal, problem.groups)
         problem = replace(problem, structure=rigid.structure, nominal=rigid.par)
         offsets = tuple(Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names))
@@ -282,6 +283,18 @@ def with_inertias(
     if not worth_it(left_over(other.final, result.final), foretold(setup, result.final, other.final)):
         return setup, result, None
     return replace(setup, problem=problem), other, rigid
+
+
+def inertias_foretell(setup: Setup) -> bool:
+    """Whether parts of the motions that are left out are predicted better with inertias found from the others.
+
+    Short motions fit well with other inertias that foretell nothing.
+    """
+    problem = setup.problem
+    try:
+        return carried_over(problem.structure, problem.nominal, problem.groups) <= CARRIED_OVER
+    except NOT_COMPUTED:
+        return False
 
 
 def worth_it(left: float, held_out: tuple[float, float]) -> bool:

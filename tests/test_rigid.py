@@ -1,5 +1,6 @@
 """Inertias of the links from motions: the regressor, consistency, and links that differ from their description."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.attribute import Attribution
+from ident.attribute import Attribution, attribute
 from ident.chain import LinkChange, build_structure
 from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose_fully, foretold, with_inertias, worth_it
@@ -197,7 +198,6 @@ def test_inertias_that_do_worse_than_the_description_are_left_at_once(moved, mon
     found = Attribution(first, True, 0.0, (), first, True)
     worse = replace(first, costs=left * first.costs)
     asked = []
-    monkeypatch.setattr("ident.diagnosis.carried_over", lambda *args: 0.0)
     monkeypatch.setattr("ident.diagnosis.fit_baseline", lambda *args: worse)
     monkeypatch.setattr("ident.diagnosis.attribute", lambda *args, **kwargs: asked.append(args[1]) or found)
     assert with_inertias(setup, found, 1, Workers()) == (setup, found, None)
@@ -231,6 +231,19 @@ def test_held_out_motions_say_whether_inertias_found_foretell(moved, ur10):
     back = foretold(setup, right, first)
     assert back == pytest.approx((1.0 / most, 1.0 / least), rel=0.2)
     assert foretold(replace(setup, held_out=()), first, right) == (0.0, np.inf)
+
+
+def test_a_long_search_leaves_time_for_one_beside_inertias_found(moved, monkeypatch):
+    ends = []
+
+    def spied(*args, workers, **kwargs):
+        ends.append(workers.deadline - began)
+        return attribute(*args, workers=workers, **kwargs)
+
+    monkeypatch.setattr("ident.diagnosis.attribute", spied)
+    began = time.monotonic()
+    diagnose_fully(moved, max_causes=0, max_seconds=1000.0)
+    assert ends == [pytest.approx(500.0, abs=20.0), pytest.approx(1000.0, abs=1.0)]
 
 
 def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
