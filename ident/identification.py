@@ -64,7 +64,7 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     if told.select(role="validation"):
         held_out = build_groups(told, role="validation", motion_band_hz=band, fast=fast)
     q_std, tau_std = _noise(dataset)
-    declared = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
+    declared = declared_position_noise(dataset)
     steps = find_steps(dataset, declared) if np.all(declared > 0) else ()
     compared, held_out = (with_rounding(x, steps, dataset) for x in (multisines or groups, held_out))
     problem = Problem(
@@ -83,6 +83,11 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     if not moves(dataset, q_std):
         raise DataError("positions", dataset.name, "no joint that moves beyond its noise", "motion that the drives bring about")
     return Setup(problem, held_out, steps, ran_away)
+
+
+def declared_position_noise(dataset: Dataset) -> np.ndarray:
+    """(n,) sample noise of the positions by the dataset, else by its robot; rad."""
+    return np.asarray(dataset.robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
 
 
 def runaways(dataset: Dataset) -> tuple[str, ...]:
@@ -170,6 +175,11 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
         setup = replace(setup, problem=without_swings(as_recorded, result))
         result = renewed(setup.problem, result, progress)
     problem, held_out = with_known_noise(with_measured_noise(setup.problem, result)), setup.held_out
+    if setup.steps:
+        noise = declared_position_noise(dataset), problem.q_std
+        groups, held_out = (with_rounding(x, setup.steps, dataset, noise) for x in (problem.groups, held_out))
+        problem = replace(problem, groups=groups)
+        result = renewed(problem, result, progress)
     if any(g.known_noise is not None for g in problem.groups):
         result = renewed(problem, result, progress)
         # Few records are held out: all that the model is fitted to tell the noise better than the end of their own transients.

@@ -56,8 +56,15 @@ def find_steps(dataset: Dataset, q_std: np.ndarray) -> tuple[Steps, ...]:
     return tuple(out)
 
 
-def with_rounding(groups: Sequence[Group], steps: Sequence[Steps], dataset: Dataset) -> tuple[Group, ...]:
-    """Groups with the error that steps leave in their positions (``rounding_error``), less what scatters between periods as noise does."""
+def with_rounding(
+    groups: Sequence[Group], steps: Sequence[Steps], dataset: Dataset, noise: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[Group, ...]:
+    """Groups with the error that steps leave in their positions (``rounding_error``), less what scatters between periods as noise does.
+
+    Args:
+        noise: (n,) sample noise of the position before it is rounded, and as it scatters in the torque residual, rad. Where None the latter is
+            taken from the positions, which move with what circulates in the loop too: that is no error, and too much is then taken off.
+    """
     if not steps:
         return tuple(groups)
     segments = {s.name: s for s in dataset.segments}
@@ -70,7 +77,8 @@ def with_rounding(groups: Sequence[Group], steps: Sequence[Steps], dataset: Data
             recorded = np.concatenate([segments[name].q[:, x.joint] for name in group.segments])
             at = x.resolution * np.angle(np.mean(np.exp(2j * np.pi * recorded / x.resolution))) / (2 * np.pi)
             error = rounding_error(group.Q[:, :, x.joint], x.resolution, at, samples, group.n_compared)
-            rounding[:, x.joint] = error * max(1.0 - _varying(group, x.joint) / error.mean(), 0.0)
+            scatter = _varying(group, x.joint) if noise is None else (noise[1][x.joint] ** 2 - noise[0][x.joint] ** 2) / samples
+            rounding[:, x.joint] = error * max(1.0 - scatter / error.mean(), 0.0)
         out.append(replace(group, rounding=rounding))
     return tuple(out)
 
