@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from ident.baseline import DETECTION_EXCESS
@@ -102,10 +102,9 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         return current, found
     ran = workers.map(finished, in_reach(ran))
     first = ran[0].fit
-    best_of: dict[tuple[str, str], Candidate] = {}
-    for c in sorted(ran, key=lambda c: c.fit.cost):
-        best_of.setdefault(c.hypothesis.key, c)
-    ran = [c for c in best_of.values() if c.hypothesis is own.hypothesis or not same_as_special(c, best_of)]
+    kept = best_of_each(ran)
+    names = {c.hypothesis.key for c in kept}
+    ran = [c for c in kept if c.hypothesis is own.hypothesis or not same_as_special(c, names)]
     excess = errors_by_joint(min((c.fit for c in ran), key=lambda r: r.cost).costs, current.counts, found.fall)
     weighed = weigh(ran, excess, found.falls, temper_of(found.before))
     best = weighed[0]
@@ -113,12 +112,22 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         best = next(c for c in weighed if c.hypothesis.key == own.hypothesis.key)
     elif best.fit is not first:
         current = polish(problem, best.fit)
-    now = {c.hypothesis.key: c.probability for c in weighed}
+    now: dict[tuple[str, str], float] = {}
+    for c in weighed:
+        now[c.hypothesis.key] = now.get(c.hypothesis.key, 0.0) + c.probability
     seen = {c.hypothesis.key for c in found.candidates}
     new = [c for c in weighed if c.hypothesis.key not in seen]
     known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
     known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
     return current, replace(found, candidates=tuple(known))
+
+
+def best_of_each(ran: Sequence[Candidate]) -> list[Candidate]:
+    """The best fit of every name. A body with its load and without keep one each: as good, they may ask for very different changes."""
+    best: dict[tuple[tuple[str, str], bool], Candidate] = {}
+    for c in sorted(ran, key=lambda c: c.fit.cost):
+        best.setdefault((c.hypothesis.key, c.hypothesis.options.get("with_load", False)), c)
+    return list(best.values())
 
 
 def in_reach(ran: Sequence[Candidate]) -> list[Candidate]:
@@ -128,7 +137,7 @@ def in_reach(ran: Sequence[Candidate]) -> list[Candidate]:
     return [c for i, c in enumerate(ran) if i == 0 or c.fit.cost - best.cost <= left]
 
 
-def same_as_special(candidate: Candidate, ran: Mapping[tuple[str, str], Candidate]) -> bool:
+def same_as_special(candidate: Candidate, ran: Collection[tuple[str, str]]) -> bool:
     """Whether a candidate is but the special case that it holds, which ran too: a cable that does not rub beside a spring."""
     h = candidate.hypothesis
     return (h.options.get("absorbs"), h.place) in ran and untold(candidate.fit, candidate.fit.model.effects[-1])

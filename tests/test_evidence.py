@@ -12,7 +12,7 @@ from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, 
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
 from ident.conclude import _cause, conclude, faint_note
-from ident.contests import alike, in_reach, same_as_special
+from ident.contests import alike, best_of_each, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
@@ -31,7 +31,7 @@ from ident.evidence import (
 )
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
-from ident.hypotheses.bodies import payload, payload_like
+from ident.hypotheses.bodies import link_inertia, payload, payload_like
 from ident.hypotheses.drive import torque_saturation
 from ident.hypotheses.hinges import hinge_inertia
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
@@ -1202,3 +1202,11 @@ def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named
     cable = Candidate(fitted.model.effects[-1].hypothesis, fitted, 0.0)
     spring = named["gravity_spring", "elbow_joint"].key
     assert same_as_special(cable, {spring: cable}) and not same_as_special(cable, {})
+
+
+def test_a_body_with_its_load_and_without_stay_in_a_contest():
+    """Fits that are as good to noise ask for changes of which one may be far simpler."""
+    bare, loaded = (link_inertia("wrist_3_link", 5, True, with_load) for with_load in (False, True))
+    load = payload("wrist_3_link")
+    ran = [Candidate(h, SimpleNamespace(cost=c), 0.0) for h, c in ((bare, 10.2), (bare, 10.1), (loaded, 10.0), (load, 10.3), (load, 12.0))]
+    assert [(c.hypothesis, c.fit.cost) for c in best_of_each(ran)] == [(loaded, 10.0), (bare, 10.1), (load, 10.3)]
