@@ -996,7 +996,7 @@ def test_an_effect_that_the_data_need_stays_and_a_companion_that_they_do_not_goe
     assert pruned(setup.problem, fitted) is fitted
 
     of = {h.key: h for h in catalogue(setup.problem.structure)}
-    slip = Effect(of["presliding_friction", "wrist_2_joint"], np.array([500.0, 0.02, 1.0]))
+    slip = Effect(of["presliding_friction", "wrist_2_joint"], np.array([500.0, 0.02, 1.0, 0.0]))
     both = polish(setup.problem, replace(fitted, model=replace(fitted.model, effects=(*fitted.model.effects, slip))))
     frictions = [SimpleNamespace(before=result, candidates=(Candidate(h, None, 0.0, 1.0),)) for h in (rub, slip.hypothesis)]
     later = SimpleNamespace(before=both, candidates=(Candidate(of["cogging", "wrist_3_joint"], None, 0.0, 1.0),))

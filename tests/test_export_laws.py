@@ -75,6 +75,17 @@ def test_presliding_friction_is_the_dahl_law(bench):
     assert np.abs(forced(model, data, q, v) + law)[half:].max() < 0.02 * 0.3
 
 
+def test_the_bending_of_a_bristle_is_damped(bench):
+    """LuGre's second coefficient, in N m s/rad, is the relaxation time by the stiffness."""
+    model, data = exported(bench, cause("presliding_friction", JOINT, stiffness=100.0, coulomb=0.3, relaxation=0.02))
+    _, q, v = swing(model, 0.02, 2.0)
+    z = 0.3 * bristle(v[None], model.opt.timestep, 0.3 / 100.0)[0]
+    law = z + 0.02 * np.gradient(z, model.opt.timestep)
+    half = len(q) // 2
+    assert np.abs(forced(model, data, q, v) + law)[half:-1].max() < 0.02 * 0.3
+    assert np.abs(law - z).max() > 0.3 * 0.3
+
+
 def test_stribeck_friction_falls_with_velocity(bench):
     model, data = exported(bench, cause("stribeck_friction", JOINT, coulomb=0.2, static=0.5, stribeck_velocity=0.1))
     t, q, v = swing(model, 0.05, 1.0)

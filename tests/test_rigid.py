@@ -270,7 +270,7 @@ def test_friction_whose_yielding_no_motion_shows_is_plain_friction(ur10, moved):
     known = catalogue(problem.structure)
     of = {h.key: h for h in known}
     bristles = tuple(
-        Effect(of["presliding_friction", name], np.array([1e8, torque, 1.0]))
+        Effect(of["presliding_friction", name], np.array([1e8, torque, 1.0, 0.0]))
         for name, torque in zip(ur10.joint_names, COULOMB, strict=True)
     )
     offsets = tuple(Effect(torque_offset(j, name), OFFSET[j : j + 1]) for j, name in enumerate(ur10.joint_names))

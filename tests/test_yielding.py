@@ -1,5 +1,7 @@
 """Elements that yield, against the differential equation, closed forms and each other."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import scipy.integrate
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 
 from ident.extended import predict
 from ident.hypotheses import catalogue
+from ident.hypotheses.friction import presliding_friction
 from ident.hypotheses.yielding import SLIP, along_path, bristle, elastoplastic, yielded, yielding_point
 from ident.identification import set_up
 from ident.model import Effect, Model
@@ -101,6 +104,27 @@ def test_a_bristle_goes_on_from_where_it_is_told():
     assert later == pytest.approx(whole[:, 150:], abs=1e-12)
 
 
+def test_presliding_friction_is_the_lugre_law():
+    """Bristle, its damping in bending, along a period of velocity: against its differential equation."""
+    stiffness, coulomb, relaxation, T = 215.0, 0.58, 0.018, 2000
+
+    def velocity(t):
+        return 0.1 * np.sin(2 * np.pi * t) + 0.04 * np.cos(6 * np.pi * t)
+
+    def rate(t, z):
+        v = velocity(t)
+        return v - stiffness * abs(v) / coulomb * z
+
+    t = np.arange(T) / T
+    found = scipy.integrate.solve_ivp(rate, (0.0, 2.0), [0.0], t_eval=1.0 + t, rtol=1e-10, atol=1e-13)
+    expected = stiffness * (found.y[0] + relaxation * rate(t, found.y[0]))
+    (law,) = presliding_friction(0, "axis").law(
+        np.array([stiffness, coulomb, 1.0, relaxation]), SimpleNamespace(v=lambda j: velocity(t)[None], time_step=1.0 / T, group=SimpleNamespace(window=None)), 0, 1e4
+    )
+    assert law == pytest.approx(expected, abs=2e-3 * coulomb)
+    assert np.abs(law - stiffness * found.y[0]).max() > 0.2 * coulomb
+
+
 def test_the_record_says_what_friction_holds_where_a_motion_begins(ur10, tmp_path):
     """The motion that closes a recording was not made, and leaves nothing in the bristles."""
     hidden = parse_effect("presliding_friction@elbow_joint:stiffness=2000,coulomb=8", ur10)
@@ -109,7 +133,7 @@ def test_the_record_says_what_friction_holds_where_a_motion_begins(ur10, tmp_pat
     problem = setup.problem
     (group,) = (g for g in (*problem.groups, *setup.held_out) if g.window is not None)
     law = next(h for h in catalogue(problem.structure) if h.key == ("presliding_friction", "elbow_joint"))
-    truth = Effect(law, np.array([2000.0, 8.0, 1.0]))
+    truth = Effect(law, np.array([2000.0, 8.0, 1.0, 0.0]))
     pred = predict(Model(problem.structure, problem.nominal, (truth,)), group, problem.sampling)
     left = np.abs(group.to_time(group.U - pred.U)[0, :, 2])[group.window > 0.99]
     second = round(1.0 / group.period_time * group.n_time)

@@ -29,6 +29,7 @@ RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
 PROJECTIONS = 2  # of what is asked at rest, onto what dry friction can be
+RELAXATION = Parameter("relaxation", "s", 0.0, 1.0, nuisance=True, center=0.0, spread=0.01, null=0.0, reported=True)  # of a bristle
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
 
@@ -217,11 +218,23 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
 
 
 def presliding_friction(joint: int, place: str) -> Hypothesis:
-    """Spring of ``stiffness`` before it slips at ``coulomb``: Dahl's bristle, or a sharper one (see ``yielding``)."""
+    """Spring of ``stiffness`` before it slips at ``coulomb``: Dahl's bristle, or a sharper one (see ``yielding``).
+
+    Its bending is damped by ``relaxation`` times the stiffness, as in the LuGre model, whose ``sigma_1`` this is (Canudas de Wit,
+    Olsson, Astrom and Lischinsky, IEEE Trans. Automatic Control 40, 1995).
+    """
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        start = held_at_start(motion, j, p[1])
+        z = bristle(motion.v(j), motion.time_step, p[1] / p[0], p[2], start)
+        rate = (np.roll(z, -1, axis=1) - np.roll(z, 1, axis=1)) / (2.0 * motion.time_step)
+        if start is not None:  # what it holds then was not bent in one step
+            rate[:, [0, -1]] = 0.0
+        return p[1] * (z + p[3] * rate)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         z = bristle(motion.v(j), motion.time_step, shape[0])
-        return Screen((z,), lambda c: np.array([c[0] / shape[0], c[0], DAHL]) if c[0] > 0 else None, shape)
+        return Screen((z,), lambda c: np.array([c[0] / shape[0], c[0], DAHL, 0.0]) if c[0] > 0 else None, shape)
 
     return Hypothesis(
         "presliding_friction",
@@ -232,8 +245,9 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             Parameter("stiffness", "N m/rad", 1e-6, 1e12, log=True, step=1e-2),
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
             replace(EXPONENT, center=DAHL, null=DAHL),
+            RELAXATION,
         ),
-        lambda p, motion, j, k: p[1] * bristle(motion.v(j), motion.time_step, p[1] / p[0], p[2], held_at_start(motion, j, p[1])),
+        law,
         lambda scale: [(f * max(scale.q, LEAST_MOTION),) for f in (0.01, 0.03, 0.1, 0.3, 1.0)],
         screen,
         "The residual torque of {joint} makes loops in position: friction that yields as a spring of"
@@ -241,13 +255,13 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
         variable="q",
         options={
             "absorbs": "coulomb_friction",
-            "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0], p[2]]),
+            "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0], *p[2:]]),
             "apart": "stiffness",
             "shown": "coulomb",
             "give": lambda p: p[1] / p[0],
             "trivial": lambda p, k: p[1] > MOST_GIVE * p[0],
             "special": lambda p: np.array([p[1], 0.0, SHARP]),
-            "widens": lambda p, s: [np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL]) for f in (0.02, 0.2)],
+            "widens": lambda p, s: [np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL, 0.0]) for f in (0.02, 0.2)],
         },
     )
 

@@ -315,7 +315,8 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         _add_passive(spec, index, name, lugre=[stiffness, 0.0, p["coulomb"], static, p["stribeck_velocity"]])
     elif cause.effect == "presliding_friction":
         if p.get("exponent", DAHL) < MOST_ROUNDED:
-            _add_passive(spec, index, name, lugre=[p["stiffness"], 0.0, p["coulomb"], p["coulomb"], 1.0])
+            damping = p["stiffness"] * p.get("relaxation", 0.0)
+            _add_passive(spec, index, name, lugre=[p["stiffness"], damping, p["coulomb"], p["coulomb"], 1.0])
         else:
             slips = maxwell_slips(p["stiffness"], p["coulomb"], p["exponent"], 1.0)
             _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"motor:{name}": 1.0})
