@@ -38,6 +38,7 @@ from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
 SETTLED_BY_INERTIAS = 0.7  # chi2 with the links' inertias found, over that without, that is worth them by itself; geometric mean over joints
 CARRIED_OVER = 0.9  # squares of the torque left with inertias found, over those with inertias described, on parts left out, that are worth them
+LEFT_TO_LINKS = 1e-3  # share of the discrepancy up to which errors of the laws of causes, not links, are what is left
 MAX_SECONDS = 600.0  # of search for causes
 SEED = 0
 
@@ -219,9 +220,9 @@ def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, worke
 
 
 def unresolved(result: Attribution) -> bool:
-    """Whether much of the discrepancy is left without a cause."""
-    final = result.final
-    return result.detected and (final.chi2_per_dof > LEFT_ERROR or result.unknown)
+    """Whether so much is left without a cause, over noise and over the discrepancy, that links which are not as described may be why."""
+    much = result.final.chi2_per_dof > LEFT_ERROR and result.left_share > LEFT_TO_LINKS
+    return result.detected and (much or result.unknown)
 
 
 def by_link_encoders(

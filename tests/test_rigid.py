@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from ident.attribute import Attribution, attribute
 from ident.chain import LinkChange, build_structure
 from ident.dataset import Dataset, Segment
-from ident.diagnosis import diagnose_fully, foretold, with_inertias, worth_it
+from ident.diagnosis import diagnose_fully, foretold, unresolved, with_inertias, worth_it
 from ident.extended import predict
 from ident.graybox import Parameters
 from ident.held_out import with_held_out
@@ -26,6 +27,7 @@ from ident.problem import predictions
 from ident.pruning import plainer
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, carried_over, fit_rigid, regressor
+from ident.rounds import left_share
 from ident.torque_fit import fit
 from ident.trust import too_fast
 from robot_assets.robot import Elasticity, load_robot
@@ -218,6 +220,17 @@ def test_inertias_that_do_worse_than_the_description_are_left_at_once(moved, mon
 )
 def test_inertias_are_kept_by_what_they_leave_of_fitted_and_of_held_out_motions(left, held_out, kept):
     assert worth_it(left, held_out) is kept
+
+
+@pytest.mark.parametrize(
+    ("left", "unknown", "asked"), [(2e5, False, True), (40.0, False, False), (1.5, False, False), (1.5, True, True)]
+)
+def test_links_are_doubted_where_much_is_left(left, unknown, asked):
+    """Over noise and over a discrepancy of a million times that: laws of causes have errors."""
+    counts = np.full(2, 100.0)
+    first, last = (SimpleNamespace(costs=x * counts, counts=counts, cost=2e2 * x, count=200.0, chi2_per_dof=x) for x in (1e6, left))
+    found = SimpleNamespace(baseline=first, final=last, detected=True, unknown=unknown, left_share=left_share(first, last))
+    assert unresolved(found) is asked
 
 
 def test_held_out_motions_say_whether_inertias_found_foretell(moved, ur10):
