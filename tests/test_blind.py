@@ -1,9 +1,12 @@
 """Effects drawn by a seed and hidden in the plant; the diagnosis sees the files alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ident.diagnosis import diagnose
+from ident.diagnosis import diagnose, diagnose_fully
+from ident.verdict import UNKNOWN
 from sim import draw_effect, run_experiment
 from sim.effects import parameters_of
 from sim.experiment import draw_drives
@@ -180,3 +183,13 @@ def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
     arm = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     damping = np.ravel(arm.dof_damping[arm.joint("link:elbow_joint").dofadr[0]])[0]
     assert damping == pytest.approx(coefficient, rel=0.02)
+
+
+def test_a_base_that_leans_is_no_cause_of_the_catalogue(ur10, tmp_path):
+    """By two degrees: every joint that bears gravity asks for something, and no name explains that."""
+    plan = small_plan(ur10, 12, levels=(1.0,), period=1000)
+    arm = replace(ur10, gravity=(9.81 * np.sin(0.03), 9.81 * np.sin(0.02), -9.81))
+    data = run_experiment(replace(plan, robot=arm), [], seed=12, timestep=5e-4)
+    result = diagnose_fully(through_files(replace(data, robot=ur10), tmp_path))
+    assert not result.verdict.causes and result.verdict.unexplained_verdict == UNKNOWN
+    assert result.candidates[0][0][:2] == ("unknown:leaning_base", "base")

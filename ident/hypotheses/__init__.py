@@ -81,6 +81,8 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         # Before the first joint it would be the base that moves.
         for before in (False, True)[: 1 + (j > 0)]:
             out += [hinges.compliance(name, j, axes, "transverse_elasticity", before) for axes in _turned(_across(chain, j))]
+    if robot.n > 1 and np.any(robot.gravity):  # of a single joint it is a body whose centre is elsewhere
+        out.append(structure.leaning_base())
     out += [hinges.compliance("base", -1, axes, "base_elasticity") for axes in _turned(np.eye(3))]
     return tuple(out)
 

@@ -1,29 +1,34 @@
-"""Changes of the chain itself, made by effects on channel "model": ``Change`` says how; gears that turn two joints, and friction of a link."""
+"""Changes of the chain itself, made by effects on channel "model": ``Change`` says how; gears that turn two joints, friction of a link, and a base that leans."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
+import scipy.linalg
 
 from ident.chain import LinkChange, Structure, build_structure
 from ident.graybox import Parameters
 from ident.hypotheses.hypothesis import Hypothesis, Parameter
+from ident.inverse import coarse_group, inverse_dynamics
 from robot_assets.robot import Elasticity
 
+TILT_STEP = 1e-3  # rad, for unit responses
 DISTANT_NATS = 2.0  # against a gear that turns another joint than the next one
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change of the chain: what ``build_structure`` and ``Parameters`` take."""
+    """A change of the chain: what ``build_structure`` and ``Parameters`` take, and ``tilt`` of gravity as of ``leaning``, rad."""
 
     elasticities: tuple[Elasticity, ...] = ()
     loads: tuple[tuple[str, pin.Inertia], ...] = ()
     links: tuple[tuple[str, LinkChange], ...] = ()
     coupling: tuple[tuple[int, int, float], ...] = ()
     link_viscous: tuple[tuple[int, float], ...] = ()
+    tilt: tuple[float, float] = (0.0, 0.0)
 
     def __add__(self, other: Change) -> Change:
         return Change(
@@ -32,6 +37,7 @@ class Change:
             self.links + other.links,
             self.coupling + other.coupling,
             self.link_viscous + other.link_viscous,
+            (self.tilt[0] + other.tilt[0], self.tilt[1] + other.tilt[1]),
         )
 
 
@@ -50,6 +56,8 @@ def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple
             links=links,
             inertias=structure.inertias,
         )
+    if any(change.tilt):
+        structure = leaning(structure, change.tilt)
     coupling = par.coupling.copy()
     for row, column, ratio in change.coupling:
         coupling[row, column] += ratio
@@ -66,6 +74,55 @@ def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple
         elastic_damping=np.concatenate([par.elastic_damping, damping]),
     )
     return structure, par
+
+
+def leaning(structure: Structure, tilt: Sequence[float]) -> Structure:
+    """The chain on a base that leans, so that gravity is turned in its frame.
+
+    Args:
+        tilt: (2,) rad, of gravity towards two axes across it that are across each other.
+    """
+    model = structure.model.copy()
+    gravity = model.gravity.linear
+    size = float(np.linalg.norm(gravity))
+    axes = scipy.linalg.null_space(gravity[None] / size)
+    turned = gravity / size + axes @ np.tan(np.asarray(tilt, float))
+    model.gravity.linear = size * turned / np.linalg.norm(turned)
+    return replace(structure, model=model)
+
+
+def leaning_base() -> Hypothesis:
+    """Decoy: a base that is not level, or not mounted as the model says. It asks for gravity torques at all joints that bear any."""
+
+    def responses(structure, par, plane, group, solution, shape):
+        coarse = coarse_group(group)
+        slow = len(coarse.omega)
+        motion = [coarse.to_time(plane.s[:slow, None] ** k * solution.Q_a[:, :slow]) for k in range(3)]
+        without = inverse_dynamics(structure, *motion)
+        out = []
+        for tilt in TILT_STEP * np.eye(2):
+            lines = np.zeros_like(solution.Q_a)
+            lines[:, :slow] = coarse.to_lines((inverse_dynamics(leaning(structure, tilt), *motion) - without) / TILT_STEP)
+            out.append(np.matmul(plane.output_per_load, lines[..., None])[..., 0])
+        return out
+
+    return Hypothesis(
+        "unknown:leaning_base",
+        "base",
+        -1,
+        "model",
+        tuple(Parameter(f"tilt_{i}", "rad", -1.0, 1.0, step=1e-3, center=0.0, spread=0.1, null=0.0) for i in "12"),
+        None,
+        lambda scale: [()],
+        None,
+        "Gravity torques are those of a base that leans, which the catalogue has no name for.",
+        variable="posture",
+        options={
+            "change": lambda p: Change(tilt=(float(p[0]), float(p[1]))),
+            "responses": responses,
+            "start": lambda c: np.clip(c, -0.5, 0.5),
+        },
+    )
 
 
 def joint_coupling(source: int, target: int, place: str, turned: str) -> Hypothesis:
