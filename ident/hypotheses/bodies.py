@@ -47,9 +47,9 @@ def payload(link: str) -> Hypothesis:
         "model",
         (
             Parameter("mass", "kg", 1e-6, 1e4, log=True, step=1e-3),
-            Parameter("com_x", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2),
-            Parameter("com_y", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2),
-            Parameter("com_z", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2),
+            Parameter("com_x", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2, null=0.0),
+            Parameter("com_y", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2, null=0.0),
+            Parameter("com_z", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2, null=0.0),
             *(Parameter(f"inertia_{i}", "kg m2", 1e-9, 1e4, log=True, step=1e-1) for i in "xyz"),
         ),
         None,
