@@ -11,8 +11,8 @@ import pinocchio as pin
 from ident.chain import LinkChange, Structure, build_structure
 from ident.group import Group
 from ident.hypotheses.hypothesis import Hypothesis, Parameter
-from ident.hypotheses.structure import Change
-from ident.inverse import Plane, coarse_group, inverse_dynamics
+from ident.hypotheses.structure import Change, torques_of_changes
+from ident.inverse import Plane
 from ident.motion import Solution
 
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
@@ -143,20 +143,13 @@ def _inertial_responses(
     ``columns`` hold dynamic parameters [m, m c, I] (10,) in the frame of the joint; inverse dynamics is
     linear in them, so that a response is a difference of two inverse dynamics.
     """
-    coarse = coarse_group(group)
-    slow = len(coarse.omega)
-    motion = [coarse.to_time(plane.s[:slow, None] ** k * solution.Q_a[:, :slow]) for k in range(3)]
-    without = inverse_dynamics(structure, *motion)
-    out = []
-    for column in columns:
+
+    def added(column: np.ndarray) -> Structure:
         model = structure.model.copy()
-        model.inertias[joint] = pin.Inertia.FromDynamicParameters(
-            model.inertias[joint].toDynamicParameters() + column
-        )
-        lines = np.zeros_like(solution.Q_a)
-        lines[:, :slow] = coarse.to_lines(inverse_dynamics(replace(structure, model=model), *motion) - without)
-        out.append(np.matmul(plane.output_per_load, lines[..., None])[..., 0])
-    return out
+        model.inertias[joint] = pin.Inertia.FromDynamicParameters(model.inertias[joint].toDynamicParameters() + column)
+        return replace(structure, model=model)
+
+    return torques_of_changes(structure, map(added, columns), plane, group, solution)
 
 
 def _move(parameters: np.ndarray, placement: pin.SE3) -> np.ndarray:

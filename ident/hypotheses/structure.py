@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +11,10 @@ import scipy.linalg
 
 from ident.chain import LinkChange, Structure, build_structure
 from ident.graybox import Parameters
+from ident.group import Group
 from ident.hypotheses.hypothesis import Hypothesis, Parameter
-from ident.inverse import coarse_group, inverse_dynamics
+from ident.inverse import Plane, coarse_group, inverse_dynamics
+from ident.motion import Solution
 from robot_assets.robot import Elasticity
 
 TILT_STEP = 1e-3  # rad, for unit responses
@@ -76,6 +78,22 @@ def apply_change(structure: Structure, par: Parameters, change: Change) -> tuple
     return structure, par
 
 
+def torques_of_changes(
+    structure: Structure, changed: Iterable[Structure], plane: Plane, group: Group, solution: Solution
+) -> list[np.ndarray]:
+    """Recorded torques and link positions (S, L, n + M) that other chains ask for along the motion of one."""
+    coarse = coarse_group(group)
+    slow = len(coarse.omega)
+    motion = [coarse.to_time(plane.s[:slow, None] ** k * solution.Q_a[:, :slow]) for k in range(3)]
+    without = inverse_dynamics(structure, *motion)
+    out = []
+    for chain in changed:
+        lines = np.zeros_like(solution.Q_a)
+        lines[:, :slow] = coarse.to_lines(inverse_dynamics(chain, *motion) - without)
+        out.append(np.matmul(plane.output_per_load, lines[..., None])[..., 0])
+    return out
+
+
 def leaning(structure: Structure, tilt: Sequence[float]) -> Structure:
     """The chain on a base that leans, so that gravity is turned in its frame.
 
@@ -95,16 +113,8 @@ def leaning_base() -> Hypothesis:
     """Decoy: a base that is not level, or not mounted as the model says. It asks for gravity torques at all joints that bear any."""
 
     def responses(structure, par, plane, group, solution, shape):
-        coarse = coarse_group(group)
-        slow = len(coarse.omega)
-        motion = [coarse.to_time(plane.s[:slow, None] ** k * solution.Q_a[:, :slow]) for k in range(3)]
-        without = inverse_dynamics(structure, *motion)
-        out = []
-        for tilt in TILT_STEP * np.eye(2):
-            lines = np.zeros_like(solution.Q_a)
-            lines[:, :slow] = coarse.to_lines((inverse_dynamics(leaning(structure, tilt), *motion) - without) / TILT_STEP)
-            out.append(np.matmul(plane.output_per_load, lines[..., None])[..., 0])
-        return out
+        leant = [leaning(structure, tilt) for tilt in TILT_STEP * np.eye(2)]
+        return [x / TILT_STEP for x in torques_of_changes(structure, leant, plane, group, solution)]
 
     return Hypothesis(
         "unknown:leaning_base",
