@@ -40,6 +40,7 @@ from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value,
 AXIS_STEP = 1e-6  # of a tilt
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
+RIVAL = 0.1  # of the probability of a cause, above which the sentence tells a rival too
 
 
 def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:
@@ -340,10 +341,24 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
     if not detected:
         return "The simulation agrees with the data: nothing beyond noise was found."
     sure = [c for c in causes if c.probability > 0.5]
+    open_ones = [] if unknown else [c for c in causes if c.probability <= 0.5]
+    possible = "; ".join(" or ".join(_said(x.effect, x.joint, x.probability) for x in likely(c)) for c in open_ones)
+    if not sure and possible:
+        return f"The simulation misses something that these data do not tell for sure: {possible}."
     if not sure:
         return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
-    names = " and ".join(f"{c.effect.replace('_', ' ')} at {c.joint} ({c.probability:.0%})" for c in sure)
+    names = " and ".join(_said(c.effect, c.joint, c.probability) for c in sure)
     of_torque = any(c.channel != "q_link" and c.effect != "encoder_quantization" for c in sure)
     closed = "" if gain is None or gain.gap_closed is None or not of_torque else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
-    rest = ", and an unknown cause remains" if unknown else ""
+    rest = ", and an unknown cause remains" if unknown else f"; not for sure {possible}" if possible else ""
     return f"The simulation misses {names}{closed}{rest}."
+
+
+def likely(cause: Cause) -> list[Cause | Alternative]:
+    """A cause and the rivals that are not far less likely, likeliest first."""
+    rivals = [a for a in cause.alternatives if a.probability > RIVAL * cause.probability]
+    return sorted([cause, *rivals], key=lambda x: -x.probability)
+
+
+def _said(effect: str, joint: str, probability: float) -> str:
+    return f"{effect.replace('_', ' ')} at {joint} ({probability:.0%})"

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.attribute import Attribution
-from ident.baseline import DETECTION_EXCESS, implausible
+from ident.baseline import DETECTION_EXCESS, JOINT_EXCESS, implausible
 from ident.contests import SAME_PERIOD
 from ident.costs import fair_costs, weighted_cost
 from ident.extended import Prediction
@@ -52,9 +52,13 @@ def _excess(result: Fit, level: float) -> np.ndarray:
 
 
 def left_of(h: Hypothesis, result: Attribution) -> float:
-    """Share of the discrepancy that is left where an effect sits, 0 to 1: there no other cause hides behind it."""
+    """Share of the discrepancy that is left where an effect sits, 0 to 1: there no other cause hides behind it.
+
+    Where all joints together leave no more than noise, that of a single one may be known as badly as ``JOINT_EXCESS`` says.
+    """
+    level = DETECTION_EXCESS if result.final.chi2_per_dof > DETECTION_EXCESS else JOINT_EXCESS
     before = _at(h, _excess(result.baseline, 1.0))
-    after = _at(h, _excess(result.final, DETECTION_EXCESS))
+    after = _at(h, _excess(result.final, level))
     return float(np.clip(after / max(before, 1e-300), 0.0, 1.0)) if after > 0.0 else 0.0
 
 

@@ -505,6 +505,49 @@ def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise,
     assert fails_held_out(gain, SimpleNamespace(chi2_per_dof=chi2), left) == refuted
 
 
+def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():
+    """Where all joints leave no more than noise, a joint of 1.15 times it is none that a cause should have explained."""
+    from ident.attribute import Attribution
+    from ident.trust import left_of
+
+    def fit(*chi2):
+        return SimpleNamespace(costs=1e3 * np.array(chi2), counts=np.full(len(chi2), 1e3), chi2_per_dof=float(np.mean(chi2)))
+
+    chain, own = (SimpleNamespace(on_chain=x, joint=1) for x in (True, False))
+    faint = Attribution(fit(1.02, 1.05, 1.15), True, 0.0, (), fit(1.0, 1.0, 1.15), False)
+    assert left_of(chain, faint) == 0.0
+    strong = replace(faint, baseline=fit(9.0, 3.0, 1.15), final=fit(1.1, 1.35, 1.15))
+    assert left_of(own, strong) == pytest.approx(0.25 / 2.0)
+    assert left_of(chain, replace(faint, final=fit(0.7, 0.8, 1.35))) > 0.1  # more than a joint's noise is known to
+
+
+@pytest.mark.parametrize(
+    ("causes", "unknown", "told"),
+    [
+        ([("backlash", 0.9, 0.05)], False, "The simulation misses backlash at a (90%)."),
+        ([("backlash", 0.9, 0.05)], True, "The simulation misses backlash at a (90%), and an unknown cause remains."),
+        (
+            [("backlash", 0.48, 0.5)],
+            False,
+            "The simulation misses something that these data do not tell for sure: torque lag at b (50%) or backlash at a (48%).",
+        ),
+        ([("backlash", 0.4, 0.0)], False, "The simulation misses something that these data do not tell for sure: backlash at a (40%)."),
+        ([("backlash", 0.4, 0.0)], True, "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."),
+        (
+            [("cogging", 0.99, 0.0), ("backlash", 0.4, 0.3)],
+            False,
+            "The simulation misses cogging at a (99%); not for sure backlash at a (40%) or torque lag at b (30%).",
+        ),
+    ],
+)
+def test_the_sentence_tells_what_is_sure_what_is_not_and_what_nothing_explains(causes, unknown, told):
+    from ident.conclude import sentence
+    from ident.verdict import Alternative, Cause
+
+    found = [Cause(e, "a", {}, p, "", (Alternative("torque_lag", "b", rival),)) for e, p, rival in causes]
+    assert sentence(found, unknown, True, None) == told
+
+
 def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
     from ident.trust import collapsed
 
