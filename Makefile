@@ -46,4 +46,5 @@ bench-blind: $(STAMP)
 
 lint: $(STAMP)
 	$(BIN)/ruff check robot_assets sim ident tests benchmarks
+	$(BIN)/ruff format --check --quiet robot_assets sim ident tests benchmarks
 	$(BIN)/mypy

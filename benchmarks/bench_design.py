@@ -25,7 +25,9 @@ POINTS = 15
 
 
 def main(count: int = 8000) -> None:
-    print(f"{POINTS} points of {count} postures; ratios: covariance determinant (D), summed variances (A) or largest eigenvalue (E)")
+    print(
+        f"{POINTS} points of {count} postures; ratios: covariance determinant (D), summed variances (A) or largest eigenvalue (E)"
+    )
     for name in ("irb", "ur10"):
         robot = load_robot(name)
         rng = np.random.default_rng(0)
@@ -38,10 +40,14 @@ def main(count: int = 8000) -> None:
         H = information(structure, par, lins, given)
         seconds, cpu = time.perf_counter() - began, time.process_time() - used
         print(f"\n{name}: postures and information at {len(x.lines)} lines {seconds:.1f} s ({cpu:.1f} s of processor)")
-        print("parameters  crit      gap  support  weights s  rounding s  efficiency   median random / designed   best random")
+        print(
+            "parameters  crit      gap  support  weights s  rounding s  efficiency   median random / designed   best random"
+        )
         # The default of `simgap experiment`: a latin hypercube in the middle of the joint range.
         middle = [
-            information(structure, par, linearised(structure, par, operating_points(robot, POINTS, rng)), given).sum(axis=0)
+            information(structure, par, linearised(structure, par, operating_points(robot, POINTS, rng)), given).sum(
+                axis=0
+            )
             for _ in range(20)
         ]
         springs = [i for i, p in enumerate(parameter_names(robot)) if p.startswith("stiffness.")]
@@ -52,7 +58,9 @@ def main(count: int = 8000) -> None:
             designed = round_weights(part, optimal_weights(part).weights, POINTS)
             loss = criterion_loss(part[None][:, designed].sum(axis=1), "D")
             other = criterion_loss(np.stack(middle)[None][..., index[:, None], index], "D")
-            print(f"{'':38s}D against 20 latin hypercubes in the middle of the range: {np.exp(np.median(other) - loss):.3g}")
+            print(
+                f"{'':38s}D against 20 latin hypercubes in the middle of the range: {np.exp(np.median(other) - loss):.3g}"
+            )
 
 
 def row(title: str, criterion: str, H: np.ndarray, rng: np.random.Generator) -> None:

@@ -32,7 +32,9 @@ FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 AVERAGES = ("h1", "jio", "ari", "har", "log")
 
 
-def closed_loop(rng: np.random.Generator, noise: float, M: int = 20, F: int = 40, n: int = 3) -> tuple[np.ndarray, Blocks]:
+def closed_loop(
+    rng: np.random.Generator, noise: float, M: int = 20, F: int = 40, n: int = 3
+) -> tuple[np.ndarray, Blocks]:
     """(G (F, n, n), spectra) of ``u = r - 0.8 y``, ``y = G u + v``; noise relative to r."""
     k = np.linspace(0.2, 2.0, F)[:, None, None]
     G = (np.eye(n) / (1 + 1j * k) + 0.15 * (1 - np.eye(n)) / (1 + 2j * k)).astype(complex)
@@ -49,7 +51,11 @@ QUICK, FULL = 10, 100  # draws
 def bias_table(draws: int = FULL) -> None:
     """Print relative bias and rms error of the five averages over noise."""
     rng = np.random.default_rng(0)
-    print("noise/r   " + "  ".join(f"{a.upper():>13s}" for a in AVERAGES) + "   relative bias / rms error, 20 realizations")
+    print(
+        "noise/r   "
+        + "  ".join(f"{a.upper():>13s}" for a in AVERAGES)
+        + "   relative bias / rms error, 20 realizations"
+    )
     for noise in (0.1, 0.3, 0.6, 1.0):
         errors = {a: [] for a in AVERAGES}
         for _ in range(draws):
@@ -69,7 +75,9 @@ def bias_table(draws: int = FULL) -> None:
 RELATIVE = 0.03  # median relative deviation of an FRF entry in the Monte Carlo
 
 
-def exact(structure: Structure, par: Parameters, postures: np.ndarray, given: Conditions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def exact(
+    structure: Structure, par: Parameters, postures: np.ndarray, given: Conditions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """FRF vectors (Q, F, n n), their derivatives (Q, F, n n, p) and roots of their covariance, noise of ``given``."""
     n, s, k = structure.n, 2j * np.pi * given.frequency, np.arange(structure.n)
     g, dg, roots = [], [], []
@@ -113,8 +121,17 @@ def frf_case(points: int, lines: int, seed: int = 0) -> dict:
     J = (np.linalg.inv(roots) @ dg[..., :-1][..., chosen]).reshape(-1, chosen.sum())
     bound = np.diag(np.linalg.inv(2 * (J.conj().T @ J).real))
     return dict(
-        structure=structure, nominal=nominal, truth=truth, postures=postures, frequency=given.frequency, g=g,
-        roots=roots, covariance=covariance, bound=bound, fitted=fitted, chosen=chosen,
+        structure=structure,
+        nominal=nominal,
+        truth=truth,
+        postures=postures,
+        frequency=given.frequency,
+        g=g,
+        roots=roots,
+        covariance=covariance,
+        bound=bound,
+        fitted=fitted,
+        chosen=chosen,
     )
 
 
@@ -133,7 +150,14 @@ def fitted_case(case: dict, frf: FRF, estimator: str, start: Parameters):
     """(estimate, error of the fitted log-parameters, seconds of processor)."""
     began = time.process_time()
     fit = fit_frf(
-        case["structure"], frf, case["nominal"], sample_time=1e-3, hold="zoh", estimator=estimator, starts=(start,), fitted=case["fitted"]
+        case["structure"],
+        frf,
+        case["nominal"],
+        sample_time=1e-3,
+        hold="zoh",
+        estimator=estimator,
+        starts=(start,),
+        fitted=case["fitted"],
     )
     seconds = time.process_time() - began
     return fit, (fit.parameters.to_log() - case["truth"].to_log())[case["chosen"]], seconds
@@ -144,7 +168,9 @@ def efficiency_table(draws: int = FULL) -> None:
     case, rng = frf_case(15, 80), np.random.default_rng(1)
     spring = np.array([name.startswith("stiffness") for name in case["fitted"]])
     size = np.sqrt(case["bound"])
-    print(f"irb, 15 points x 80 lines, {len(spring)} parameters, {draws} draws of {RELATIVE:.0%} FRF noise; bound: springs {np.median(size[spring]):.1e}, dampers {np.median(size[~spring]):.1e} (median)")
+    print(
+        f"irb, 15 points x 80 lines, {len(spring)} parameters, {draws} draws of {RELATIVE:.0%} FRF noise; bound: springs {np.median(size[spring]):.1e}, dampers {np.median(size[~spring]):.1e} (median)"
+    )
     out = {e: ([], [], []) for e in ESTIMATORS}
     for _ in range(draws):
         frf = draw(case, rng)
@@ -153,7 +179,9 @@ def efficiency_table(draws: int = FULL) -> None:
             errors.append(error)
             inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(fit.covariance)))
             seconds.append(took)
-    print("estimator   MSE / bound: all   springs   dampers   largest    bias^2 / MSE   coverage: mean  least   CPU s, median of one start")
+    print(
+        "estimator   MSE / bound: all   springs   dampers   largest    bias^2 / MSE   coverage: mean  least   CPU s, median of one start"
+    )
     for estimator, (errors, inside, seconds) in out.items():
         e, mse = np.array(errors), np.mean(np.square(errors), axis=0)
         ratio, covered = mse / case["bound"], np.mean(inside, axis=0)

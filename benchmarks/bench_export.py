@@ -32,7 +32,17 @@ from sim.effects import EFFECTS, parameters_of
 from sim.experiment import plan_experiment
 
 STRENGTH = 1.0
-START = {"smoothing_velocity": 1e-3, "inertia": 1e-3, "reaction": 1.0, "viscous": 1.0, "com_x": 0.0, "com_y": 0.0, "com_z": 0.0, "tilt_1": 0.0, "tilt_2": 0.0}
+START = {
+    "smoothing_velocity": 1e-3,
+    "inertia": 1e-3,
+    "reaction": 1.0,
+    "viscous": 1.0,
+    "com_x": 0.0,
+    "com_y": 0.0,
+    "com_z": 0.0,
+    "tilt_1": 0.0,
+    "tilt_2": 0.0,
+}
 
 
 def true_hypothesis(problem: Problem, effect) -> Effect:
@@ -45,7 +55,11 @@ def true_hypothesis(problem: Problem, effect) -> Effect:
         truth |= {"sine": truth["amplitude"] * np.cos(phase), "cosine": truth["amplitude"] * np.sin(phase)}
     fits = [h for h in catalogue(problem.structure) if (h.effect, h.place) == (effect.name, effect.place)]
     if "axis" in truth:
-        fits = [h for h in fits if tuple(h.options["axis"](np.zeros(len(h.parameters)))) == tuple(truth["axis"]) and not h.options["before"]]
+        fits = [
+            h
+            for h in fits
+            if tuple(h.options["axis"](np.zeros(len(h.parameters)))) == tuple(truth["axis"]) and not h.options["before"]
+        ]
     if not fits:
         raise LookupError("no hypothesis of the torque equation")
     values = [float(truth.get(p.name, START.get(p.name, 1.0))) for p in fits[0].parameters]
@@ -63,7 +77,14 @@ def small_dataset(robot: Robot, name: str, seed: int, period: int, levels: tuple
     """An effect of a kind drawn and hidden in an arm with the drives of its description, and the data of it."""
     rng = np.random.default_rng(seed)
     postures = operating_points(robot, 2, rng)
-    options = {"points": 1, "validation_points": 1, "levels": levels, "seed": seed, "period": period, "trajectory": False}
+    options = {
+        "points": 1,
+        "validation_points": 1,
+        "levels": levels,
+        "seed": seed,
+        "period": period,
+        "trajectory": False,
+    }
     plan = plan_experiment(robot, postures, **options)
     effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH)
     return effect, run_experiment(plan, [effect], seed=seed)
@@ -98,7 +119,9 @@ def main() -> None:
     parser.add_argument("--levels", type=float, nargs="+", default=[1.0, 0.4])
     args = parser.parse_args()
     robot = load_robot(args.robot)
-    print(f"{'effect':22s} {'place':20s} {'before':>9s} {'noise':>9s} {'predicted':>9s} {'simulated':>9s} {'difference':>10s}  seconds")
+    print(
+        f"{'effect':22s} {'place':20s} {'before':>9s} {'noise':>9s} {'predicted':>9s} {'simulated':>9s} {'difference':>10s}  seconds"
+    )
     for name in args.effects:
         began = time.perf_counter()
         # A seed of its own for each effect: places differ.
@@ -110,7 +133,9 @@ def main() -> None:
             print(f"{name:22s} {effect.place:20s} {err}", flush=True)
             continue
         if predicted is None or simulated is None:
-            print(f"{name:22s} {effect.place:20s} no segment followed by {'the prediction' if predicted is None else 'the simulation'}")
+            print(
+                f"{name:22s} {effect.place:20s} no segment followed by {'the prediction' if predicted is None else 'the simulation'}"
+            )
             continue
         closed = [g.gap_closed for g in (predicted, simulated)]
         shown = [f"{'no gap':>9s}" if c is None else f"{c:9.3f}" for c in closed]

@@ -70,7 +70,11 @@ def estimator_table(data: Dataset, exact: np.ndarray, blocks: list[range]) -> No
     common = np.mean([g.mean(axis=0) for g in found.values()], axis=0)
     groups = [(f < LOW, driving), (f >= LOW, driving), (f < LOW, ~driving), (f >= LOW, ~driving)]
     names = (f"driving <{LOW:g} Hz", "driving above", f"coupling <{LOW:g} Hz", "coupling above")
-    print("     " + "".join(f"{name:>20s}" for name in names) + "   bias / std (distance from the five), median, % of the entry")
+    print(
+        "     "
+        + "".join(f"{name:>20s}" for name in names)
+        + "   bias / std (distance from the five), median, % of the entry"
+    )
     for a, g in found.items():
         spread, off = g.var(axis=0, ddof=1), np.abs(g.mean(axis=0) - exact) ** 2
         # The mean of few estimates is off by chance as well: that part of the bias is taken out.
@@ -90,7 +94,10 @@ def spending_table(data: Dataset, blocks: list[range]) -> None:
         g = np.stack([estimate_frf(part(data, m, P), estimator="jio").G[0] for m in many])
         spread = g.std(axis=0, ddof=1) / np.abs(g.mean(axis=0))
         cells.append(f"{100 * np.median(spread):6.2f}")
-    print("JIO, median std of an entry, %:  " + "   ".join(f"{M} x {P}: {c}" for (M, P), c in zip(SPENDING, cells, strict=True)))
+    print(
+        "JIO, median std of an entry, %:  "
+        + "   ".join(f"{M} x {P}: {c}" for (M, P), c in zip(SPENDING, cells, strict=True))
+    )
 
 
 def main(full: bool = False) -> None:
@@ -99,12 +106,24 @@ def main(full: bool = False) -> None:
     count = REALIZATIONS * (12 if full else 4)
     posture = draw_candidates(robot, 1, np.random.default_rng(4)).q
     plan = plan_experiment(
-        robot, posture, points=1, validation_points=0, realizations=count, levels=(1.0,), seed=1, period=2000, periods=PERIODS + 1,
-        per_decade=30, band_hz=(0.5, 60.0), trajectory=False,
+        robot,
+        posture,
+        points=1,
+        validation_points=0,
+        realizations=count,
+        levels=(1.0,),
+        seed=1,
+        period=2000,
+        periods=PERIODS + 1,
+        per_decade=30,
+        band_hz=(0.5, 60.0),
+        trajectory=False,
     )
     blocks = [range(k, k + REALIZATIONS) for k in range(1, count, REALIZATIONS)]
     effects = spoilt(robot, np.stack([e.r for e in plan.experiments]))
-    print(f"irb, one posture, {len(plan.excitation.lines)} lines, {len(blocks)} estimates of {REALIZATIONS} realizations x {PERIODS} periods")
+    print(
+        f"irb, one posture, {len(plan.excitation.lines)} lines, {len(blocks)} estimates of {REALIZATIONS} realizations x {PERIODS} periods"
+    )
     for title, hidden, noise in (("plain noise", [], NOISE), ("friction and ripple", effects, 1.0)):
         data = run_experiment(plan, hidden, seed=2, noise=noise, timestep=1e-3)
         q = estimate_frf(part(data, blocks[0])).q0[0]

@@ -77,7 +77,9 @@ def main() -> None:
             # A process each, so that one's memory is not the other's; the second reading finds the file in memory too.
             with get_context("spawn").Pool(1) as pool:
                 seconds[name], memory, found = pool.apply(measured, ((function, path),))
-            print(f"{name:8s} {seconds[name]:6.2f} s, {path.stat().st_size / 1e6 / seconds[name]:5.0f} MB/s, peak {memory:.2f} GB, {found} rows")
+            print(
+                f"{name:8s} {seconds[name]:6.2f} s, {path.stat().st_size / 1e6 / seconds[name]:5.0f} MB/s, peak {memory:.2f} GB, {found} rows"
+            )
         print(f"speed over that of pyarrow: {seconds['pyarrow'] / seconds['simgap']:.2f}")
 
 

@@ -1,9 +1,9 @@
 """One experiment instead of n: parameter accuracy over experiment time, local against classical FRFs.
 
-The UR10 plant with its noise and its own nonlinearity, effect-free, drives off by up to two, at three points. Classical: n orthogonal
-experiments, the transient period thrown away. Local: one multisine in all joints from rest, nothing thrown away.
-Errors are of the log-parameters by WLLS, root mean square over parameters and seeds; "error / std" is 1 where the
-standard deviations of the fit are honest.
+The UR10 plant with its noise and its own nonlinearity, effect-free, drives off by up to two, at three points.
+Classical: n orthogonal experiments, the transient period thrown away. Local: one multisine in all joints from rest,
+nothing thrown away. Errors are of the log-parameters by WLLS, root mean square over parameters and seeds; "error / std"
+is 1 where the standard deviations of the fit are honest.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ def main(seeds: tuple[int, ...] = SEEDS) -> None:
     rows = [("jio", period, periods, "detection", None) for period, periods in CLASSICAL]
     rows += [(m, samples, 1, grid, 1) for samples in LOCAL for grid in ("odd", "all") for m in ("lpm", "lrm")]
     print(f"ur10, {POINTS} points, seeds {seeds}; rms errors of log-parameters")
-    print("FRF  lines      s/point  experiments  centres   springs   dampers   inertia   friction   error / std   FRF s   fit s")
+    print(
+        "FRF  lines      s/point  experiments  centres   springs   dampers   inertia   friction   error / std   FRF s   fit s"
+    )
     for method, period, periods, grid, experiments in rows:
         errors, scaled, took = [], [], []
         for seed in seeds:

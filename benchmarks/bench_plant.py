@@ -22,8 +22,18 @@ def main() -> None:
     plant = build_plant(robot)
     postures = operating_points(robot, 2, np.random.default_rng(0))
     inertia = np.min([link_inertia_diagonal(plant, q) for q in postures], axis=0)
-    plan = make_plan(robot, points=2, validation_points=0, levels=(1.0, 0.5, 0.25), period=PERIOD, periods=PERIODS,
-                     band_hz=(2.0, 70.0), postures=postures, inertia=inertia, trajectory=False)
+    plan = make_plan(
+        robot,
+        points=2,
+        validation_points=0,
+        levels=(1.0, 0.5, 0.25),
+        period=PERIOD,
+        periods=PERIODS,
+        band_hz=(2.0, 70.0),
+        postures=postures,
+        inertia=inertia,
+        trajectory=False,
+    )
     steps = len(plan.experiments) * PERIOD * PERIODS * 4
     began = time.perf_counter()
     run_experiment(plan)

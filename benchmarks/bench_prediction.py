@@ -14,9 +14,9 @@ the true ones by up to two, and fit stiffness, damping, motor inertia and fricti
 
 "late": from the first WLLS estimate instead, for prediction errors have local minima. Seconds are of processor,
 compilation left out, and the median over the starts. A start has converged where every spring ends within 5 % of the
-truth and every damper within 50 %; errors are over those starts, or over all, marked "all", where none has. No fit takes
-more than ``LIMIT`` steps, each a Jacobian by differences; "cut" counts those that were stopped by it. Evaluations are
-runs of the predictor or of the simulation over all the data, the median over the starts.
+truth and every damper within 50 %; errors are over those starts, or over all, marked "all", where none has. No fit
+takes more than ``LIMIT`` steps, each a Jacobian by differences; "cut" counts those that were stopped by it. Evaluations
+are runs of the predictor or of the simulation over all the data, the median over the starts.
 
     python benchmarks/bench_prediction.py [--full] [--arms twomass pair ur10 irb]
 """
@@ -96,15 +96,36 @@ def pair() -> Robot:
     keep = ("shoulder_lift_joint", "elbow_joint")
     k = [robot.joint_names.index(name) for name in keep]
     locked = {name: 0.3 for name in robot.joint_names if name not in keep}
-    return replace(robot, joints=tuple(robot.joints[i] for i in k), locked=locked, q_min=robot.q_min[k], q_max=robot.q_max[k])
+    return replace(
+        robot, joints=tuple(robot.joints[i] for i in k), locked=locked, q_min=robot.q_min[k], q_max=robot.q_max[k]
+    )
 
 
-def make_case(title: str, robot: Robot, starts: int, *, level: float, points: int = 1, period: int = 1000, high: float = 70.0, seed: int = 1) -> Case:
+def make_case(
+    title: str,
+    robot: Robot,
+    starts: int,
+    *,
+    level: float,
+    points: int = 1,
+    period: int = 1000,
+    high: float = 70.0,
+    seed: int = 1,
+) -> Case:
     """Simulate: one realization at each point, one transient period and two that count."""
     rng = np.random.default_rng(seed)
     postures = operating_points(robot, points, rng)
     plan = plan_experiment(
-        robot, postures, points=points, validation_points=0, levels=(level,), period=period, periods=3, trajectory=False, seed=seed, band_hz=(0.4, high)
+        robot,
+        postures,
+        points=points,
+        validation_points=0,
+        levels=(level,),
+        period=period,
+        periods=3,
+        trajectory=False,
+        seed=seed,
+        band_hz=(0.4, high),
     )
     drives = draw_drives(rng, robot)
     data = run_experiment(plan, drives=drives, seed=seed)
@@ -113,7 +134,13 @@ def make_case(title: str, robot: Robot, starts: int, *, level: float, points: in
     truth[: 4 * robot.n] = np.log(np.concatenate([drives[f] for f in DRIVE_FIELDS]))
     off = rng.uniform(-np.log(2), np.log(2), (starts, len(truth)))
     return Case(
-        title, robot, build_structure(robot), data, runs_of(data), truth, tuple(nominal.with_log(truth + d) for d in off)
+        title,
+        robot,
+        build_structure(robot),
+        data,
+        runs_of(data),
+        truth,
+        tuple(nominal.with_log(truth + d) for d in off),
     )
 
 
@@ -126,7 +153,13 @@ def wlls(case: Case, start: Parameters) -> End:
     frf = estimate_frf(case.data)
     return End(
         fit_frf(
-            case.structure, frf, start, sample_time=case.runs.sample_time, hold="zoh", starts=(start,), fitted=parameter_names(case.robot)
+            case.structure,
+            frf,
+            start,
+            sample_time=case.runs.sample_time,
+            hold="zoh",
+            starts=(start,),
+            fitted=parameter_names(case.robot),
         ).parameters
     )
 
@@ -138,7 +171,10 @@ def pem(case: Case, predictor: Predictor, start: Parameters, **options) -> End:
 
 
 def particles(case: Case, start: Parameters) -> End:
-    predictor, guide = particle_filter(case.structure, case.runs, particles=PARTICLES), extended_kalman(case.structure, case.runs)
+    predictor, guide = (
+        particle_filter(case.structure, case.runs, particles=PARTICLES),
+        extended_kalman(case.structure, case.runs),
+    )
     return pem(case, predictor, start, guide=guide, steps=6, promise=10.0)
 
 
@@ -168,7 +204,18 @@ def output_error(case: Case) -> Callable[[Parameters], End]:
         looks += 1
         plant = build_plant(robot, drives=drives_of(x), timestep=STEP)
         start = np.stack([rest(plant, q)[0] for q in q0])
-        run = run_loop(plant, start, q0[:, None], r, samples, loop, silent, case.data.sample_rate, np.random.default_rng(0), np.zeros(len(q0)))
+        run = run_loop(
+            plant,
+            start,
+            q0[:, None],
+            r,
+            samples,
+            loop,
+            silent,
+            case.data.sample_rate,
+            np.random.default_rng(0),
+            np.zeros(len(q0)),
+        )
         e = [(a - b[:, skip:]) / s for a, b, s in zip(signals, (run.tau, run.q), sizes, strict=True)]
         return np.clip(np.nan_to_num(np.concatenate([x.ravel() for x in e]), nan=1e6), -1e6, 1e6)
 
@@ -205,14 +252,19 @@ def peer(case: Case) -> Callable[[Parameters], End] | None:
         spec = build_spec(robot, drives=drives_of(x), timestep=STEP)
         for prefix in ("torque", "servo"):
             for j, name in enumerate(robot.joint_names):
-                act = spec.add_actuator(name=f"{prefix}:{name}", target=f"motor:{name}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+                act = spec.add_actuator(
+                    name=f"{prefix}:{name}", target=f"motor:{name}", trntype=mujoco.mjtTrn.mjTRN_JOINT
+                )
                 if prefix == "torque":
                     act.set_to_motor()
                 else:
                     act.set_to_position(kp=kp[j], kv=kd[j])
         for name in robot.joint_names:
             spec.add_sensor(
-                name=f"q:{name}", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=f"motor:{name}"
+                name=f"q:{name}",
+                type=mujoco.mjtSensor.mjSENS_JOINTPOS,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                objname=f"motor:{name}",
             )
         return spec
 
@@ -250,15 +302,25 @@ def peer(case: Case) -> Callable[[Parameters], End] | None:
             mapping = TimeSeries.compute_all_sensor_mapping(model)
             sequences.append(
                 ModelSequences(
-                    f"point {p}", spec, [f"run {r}" for r in mine], [state] * len(mine),
-                    [TimeSeries(times, np.concatenate([runs.u[r] + kd * velocity[r], middle[r]], axis=1)) for r in mine],
+                    f"point {p}",
+                    spec,
+                    [f"run {r}" for r in mine],
+                    [state] * len(mine),
+                    [
+                        TimeSeries(times, np.concatenate([runs.u[r] + kd * velocity[r], middle[r]], axis=1))
+                        for r in mine
+                    ],
                     [TimeSeries(times, runs.y[r], mapping) for r in mine],
                 )
             )
         params = ParameterDict()
         for i, (kind, name) in enumerate((kind, name) for kind in DRIVE_FIELDS for name in robot.joint_names):
-            params[f"{kind}.{name}"] = Parameter(f"{kind}.{name}", x[i], x[i] - RANGE, x[i] + RANGE, modifier=setter(kind, name))
-        inner = build_residual_fn(models_sequences=sequences, modify_residual=difference, resample_true=False, n_threads=1)
+            params[f"{kind}.{name}"] = Parameter(
+                f"{kind}.{name}", x[i], x[i] - RANGE, x[i] + RANGE, modifier=setter(kind, name)
+            )
+        inner = build_residual_fn(
+            models_sequences=sequences, modify_residual=difference, resample_true=False, n_threads=1
+        )
         looks, steps = 0, 0
 
         def residual(x: np.ndarray, params: ParameterDict, **options):
@@ -271,7 +333,9 @@ def peer(case: Case) -> Callable[[Parameters], End] | None:
             steps = len(trace)
 
         with contextlib.redirect_stdout(io.StringIO()):
-            found, _ = optimize(params, residual, optimizer="mujoco", verbose=False, max_iters=LIMIT, iter_callback=count)
+            found, _ = optimize(
+                params, residual, optimizer="mujoco", verbose=False, max_iters=LIMIT, iter_callback=count
+            )
         return End(start.with_log(found.as_vector()), looks, steps == LIMIT)
 
     return fit
@@ -294,8 +358,12 @@ def timed(fit: Callable[[Parameters], End], starts: Sequence[Parameters]) -> tup
 def table(case: Case, *, filtered: bool = True, chance: bool = False, simulated: bool = True) -> None:
     """Print a row a method."""
     runs, n = case.runs, case.robot.n
-    print(f"{case.title}: {len(runs.u)} experiments x {runs.u.shape[1]} samples, {len(case.truth)} parameters, {len(case.starts)} starts")
-    print("method                     springs: median    worst   dampers: median    worst   converged   CPU s   x WLLS   evaluations   cut")
+    print(
+        f"{case.title}: {len(runs.u)} experiments x {runs.u.shape[1]} samples, {len(case.truth)} parameters, {len(case.starts)} starts"
+    )
+    print(
+        "method                     springs: median    worst   dampers: median    worst   converged   CPU s   x WLLS   evaluations   cut"
+    )
     base = None
 
     def row(name: str, ends: list[End | None], seconds: list[float]) -> None:
@@ -305,7 +373,10 @@ def table(case: Case, *, filtered: bool = True, chance: bool = False, simulated:
         errors = np.abs(np.expm1(np.array([e.parameters.to_log() - case.truth for e in ended]).reshape(-1, 4, n)))
         good = (errors[:, 0].max(axis=1) < SPRINGS) & (errors[:, 1].max(axis=1) < DAMPERS)
         shown = errors[good] if good.any() else errors
-        cells = [f"{np.median(e):8.1e}   {e.max():6.1e}" if len(ended) else "       -        -" for e in (shown[:, 0], shown[:, 1])]
+        cells = [
+            f"{np.median(e):8.1e}   {e.max():6.1e}" if len(ended) else "       -        -"
+            for e in (shown[:, 0], shown[:, 1])
+        ]
         count = [e.evaluations for e in ended if e.evaluations is not None]
         print(
             f"{name:26s}        {cells[0]}          {cells[1]}   {good.sum():5d}/{len(ends)} {' ' if good.any() else 'all'}"
@@ -324,8 +395,11 @@ def table(case: Case, *, filtered: bool = True, chance: bool = False, simulated:
     matched, seconds = timed(lambda s: wlls(case, s), case.starts)
     row("WLLS on FRFs", matched, seconds)
     if matched[0] is None:
-        raise DataError("WLLS", case.title, "a failure at the first start", "an estimate that the others can begin with")
+        raise DataError(
+            "WLLS", case.title, "a failure at the first start", "an estimate that the others can begin with"
+        )
     first = matched[0].parameters
+
     def predicted(name: str, make: Callable[[Structure, Runs], Predictor]) -> End | None:
         predictor = make(case.structure, runs)
         predictor(case.starts[0], first_noise(case))
@@ -346,7 +420,9 @@ def table(case: Case, *, filtered: bool = True, chance: bool = False, simulated:
         near = first.with_log(first.to_log() + NEAR * np.resize([1.0, -1.0, -1.0, 1.0], len(case.truth)))
         row("particle filter, near", *timed(lambda s: particles(case, s), [near]))
         draws = [
-            particle_filter(case.structure, runs, particles=PARTICLES, seed=seed)(late.parameters, late.fit.noise).log_likelihood
+            particle_filter(case.structure, runs, particles=PARTICLES, seed=seed)(
+                late.parameters, late.fit.noise
+            ).log_likelihood
             for seed in range(5)
         ]
         print(
@@ -357,10 +433,20 @@ def table(case: Case, *, filtered: bool = True, chance: bool = False, simulated:
 
 
 def equivalence(case: Case) -> None:
-    """Print how far local PEM and FRF matching are from each other in standard deviations, and these over each other."""
+    """Print how far local PEM and FRF matching are from each other in standard deviations, and these over each
+    other."""
     names, start = parameter_names(case.robot), Parameters.nominal(case.robot).with_log(case.truth)
     frf = estimate_frf(case.data)
-    match = fit_frf(case.structure, frf, start, sample_time=case.runs.sample_time, hold="zoh", estimator="wnls", starts=(start,), fitted=names)
+    match = fit_frf(
+        case.structure,
+        frf,
+        start,
+        sample_time=case.runs.sample_time,
+        hold="zoh",
+        estimator="wnls",
+        starts=(start,),
+        fitted=names,
+    )
     local = fit_prediction(local_predictor(case.structure, case.runs), case.structure, start, first_noise(case))
     std = np.sqrt(np.diag(local.covariance))[: len(names)]
     apart = (local.parameters.to_log() - match.parameters.to_log()) / std
@@ -379,7 +465,9 @@ def whole_arm() -> None:
         _, error, took = fitted_case(case, draw(case, np.random.default_rng(k)), "wlls", case["nominal"])
         seconds.append(took)
     fit = float(np.median(seconds))
-    print(f"irb, WLLS on given FRFs of 15 points x 80 lines x 6 x 6: {fit:.2f} CPU s from one start (median of 3), worst error {np.abs(error).max():.1e}")
+    print(
+        f"irb, WLLS on given FRFs of 15 points x 80 lines x 6 x 6: {fit:.2f} CPU s from one start (median of 3), worst error {np.abs(error).max():.1e}"
+    )
     arm = make_case("irb", load_robot("irb"), 1, level=1.0, period=500)
     samples = 15 * 6 * 20000  # one period a FRF of frf_case
     predict, start = extended_kalman(arm.structure, arm.runs), arm.starts[0]

@@ -73,16 +73,18 @@ class Case:
 
     def truth(self, size: Callable[[object], float]) -> list[dict]:
         return [
-            {"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e)), "size": size(e)} for e in self.hidden
+            {"effect": e.name, "place": e.place, "parameters": _plain(parameters_of(e)), "size": size(e)}
+            for e in self.hidden
         ]
 
     def sizer(self) -> Callable[[object], float]:
-        """Distortion over noise of an effect: what it alone changes at the joint and posture (none held out) that show it most.
+        """Distortion over noise of an effect: what it alone changes at the joint and posture (none held out) that show
+        it most.
 
-        Root mean square over the excited band of what changes in torque and position lines and no change of the drives would
-        make, over the noise of these lines, in the first experiment at the largest level; the plant is simulated without noise,
-        for one steady period. Its step is coarse: a size is a difference of two simulations, and of the error of the step little
-        is left in it.
+        Root mean square over the excited band of what changes in torque and position lines and no change of the drives
+        would make, over the noise of these lines, in the first experiment at the largest level; the plant is simulated
+        without noise, for one steady period. Its step is coarse: a size is a difference of two simulations, and of the
+        error of the step little is left in it.
         """
         plan, robot = self.plan, self.plan.robot
         shown = [e for e in shown_in(plan) if e.experiment == 1]
@@ -200,7 +202,11 @@ def run_case(
             result = diagnose_fully(load_dataset(Path(folder) / "d"))
         except Exception as err:
             where = traceback.extract_tb(err.__traceback__)[-1]
-            return {"seed": seed, "truth": truth, "error": f"{type(err).__name__}: {err} in {where.name}:{where.lineno}"}
+            return {
+                "seed": seed,
+                "truth": truth,
+                "error": f"{type(err).__name__}: {err} in {where.name}:{where.lineno}",
+            }
     v = result.verdict.to_dict()
     return {
         "seed": seed,
@@ -235,7 +241,12 @@ def judge(row: dict) -> dict:
         for c in causes:
             if (c["effect"], c["joint"]) == (t["effect"], t["place"]):
                 for k, v in t["parameters"].items():
-                    if isinstance(v, float) and k in c["parameters"] and k not in ("phase", "asymmetry", "coulomb") and v:
+                    if (
+                        isinstance(v, float)
+                        and k in c["parameters"]
+                        and k not in ("phase", "asymmetry", "coulomb")
+                        and v
+                    ):
                         errors.append(abs(c["parameters"][k]["value"] / v - 1))
     return {"right": right, "any": bool(named & wanted), "named": sorted(named), "errors": errors}
 
@@ -281,7 +292,9 @@ def main() -> None:
     parser.add_argument("--robot", default="ur10", help="folder or name of an arm; 'mix' draws one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--executor", default="processes", help="processes, processes:N or dask://HOST:PORT")
-    parser.add_argument("--sizes", type=float, nargs=2, metavar=("LOW", "HIGH"), help="distortion over noise of every effect")
+    parser.add_argument(
+        "--sizes", type=float, nargs=2, metavar=("LOW", "HIGH"), help="distortion over noise of every effect"
+    )
     parser.add_argument("--cases", type=int, help="number of cases, instead of a size")
     parser.add_argument("--out", type=Path, help="stem of the results: .json, .txt and .png")
     args = parser.parse_args()

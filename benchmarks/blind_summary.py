@@ -56,7 +56,9 @@ def calibration_error(pairs: list[tuple[float, bool]]) -> float:
         return float("nan")
     p, right = np.array([x for x, _ in pairs]), np.array([y for _, y in pairs], float)
     bin_of = np.digitize(p, BINS) - 1
-    return float(sum(abs(p[bin_of == b].mean() - right[bin_of == b].mean()) * np.mean(bin_of == b) for b in set(bin_of)))
+    return float(
+        sum(abs(p[bin_of == b].mean() - right[bin_of == b].mean()) * np.mean(bin_of == b) for b in set(bin_of))
+    )
 
 
 def table(rows: list[dict]) -> str:
@@ -87,7 +89,9 @@ def table(rows: list[dict]) -> str:
         right = sum(named(r) == truth_of(r) for r in shown)
         out.append(f"one, of at least {SEEN:g} times the noise: exactly right {right} of {len(shown)}")
     errors = [e for r in rows for e in r.get("judged", {}).get("errors", [])]
-    closed = [r["gain"]["gap_closed"] for r in rows if kind(r) in ("one", "two") and (r.get("gain") or {}).get("gap_closed")]
+    closed = [
+        r["gain"]["gap_closed"] for r in rows if kind(r) in ("one", "two") and (r.get("gain") or {}).get("gap_closed")
+    ]
     seconds = [r["diagnosed_s"] for r in rows if "diagnosed_s" in r]
     if errors:
         out.append(f"parameter error: median {np.median(errors):.3%}, 90 % within {np.quantile(errors, 0.9):.2%}")
@@ -102,7 +106,9 @@ def table(rows: list[dict]) -> str:
 
 def pictures(rows: list[dict], path: Path) -> None:
     """Confusion, detection against size and reliability, side by side in one PNG."""
-    fig, (confusion, detection, reliability) = plt.subplots(1, 3, figsize=(19, 7), width_ratios=(1.5, 1, 1), layout="constrained")
+    fig, (confusion, detection, reliability) = plt.subplots(
+        1, 3, figsize=(19, 7), width_ratios=(1.5, 1, 1), layout="constrained"
+    )
     _confusion(confusion, rows)
     _detection(detection, rows)
     _reliability(reliability, rows)
@@ -122,7 +128,14 @@ def _confusion(ax, rows: list[dict]) -> None:
     image = np.array([[counts[(a, b)] for b in below] for a in left])
     ax.imshow(image, cmap="Blues", aspect="auto")
     for y, x in zip(*np.nonzero(image), strict=True):
-        ax.text(x, y, str(image[y, x]), ha="center", va="center", color="white" if image[y, x] > image.max() / 2 else "black")
+        ax.text(
+            x,
+            y,
+            str(image[y, x]),
+            ha="center",
+            va="center",
+            color="white" if image[y, x] > image.max() / 2 else "black",
+        )
     ax.set_xticks(range(len(below)), [b.replace("_", " ") for b in below], rotation=60, ha="right", fontsize=8)
     ax.set_yticks(range(len(left)), [a.replace("_", " ") for a in left], fontsize=8)
     ax.set_xlabel("named")
@@ -159,8 +172,12 @@ def _reliability(ax, rows: list[dict]) -> None:
     ax.plot([0, 1], [0, 1], color="#8a8a8a", lw=1)
     for b in sorted(set(bin_of)):
         inside = bin_of == b
-        ax.plot(p[inside].mean(), right[inside].mean(), "o", color="#2a7f9e", ms=4 + 2 * np.sqrt(inside.sum()), alpha=0.7)
-        ax.annotate(str(int(inside.sum())), (p[inside].mean(), right[inside].mean()), fontsize=8, ha="center", va="center")
+        ax.plot(
+            p[inside].mean(), right[inside].mean(), "o", color="#2a7f9e", ms=4 + 2 * np.sqrt(inside.sum()), alpha=0.7
+        )
+        ax.annotate(
+            str(int(inside.sum())), (p[inside].mean(), right[inside].mean()), fontsize=8, ha="center", va="center"
+        )
     ax.set_xlabel("probability stated")
     ax.set_ylabel("share that was right")
     ax.grid(alpha=0.3)

@@ -1,9 +1,9 @@
 """Plain references on held-out motion: models as published, and rigid body with friction by least squares.
 
-Errors are those of ``simgap``'s gain: the same recordings and split, the same window and band, the same unit. All else is
-written apart from what ``simgap`` fits: positions low-passed without phase and differentiated by central differences,
-Pinocchio's regressor, one linear least squares whose joints are weighted by what is left at them (Gautier, J. Robotic
-Systems 14, 1997; Janot, Vandanjon and Gautier, IEEE Trans. Control Syst. Technol. 22, 2014).
+Errors are those of ``simgap``'s gain: the same recordings and split, the same window and band, the same unit. All else
+is written apart from what ``simgap`` fits: positions low-passed without phase and differentiated by central
+differences, Pinocchio's regressor, one linear least squares whose joints are weighted by what is left at them (Gautier,
+J. Robotic Systems 14, 1997; Janot, Vandanjon and Gautier, IEEE Trans. Control Syst. Technol. 22, 2014).
 """
 
 from __future__ import annotations
@@ -29,16 +29,19 @@ ORDER = 4  # of that Butterworth filter, run forth and back
 PAD = 3.0  # periods of its cut-off by which a record is prolonged at either end
 REWEIGHTINGS = 6
 NONE = 1e-9  # of the largest column, below which one says nothing
-TRUNCATIONS = (1e-6, 1e-2, 3e-2)  # singular values over the largest, left out: of what no motion shows; of what this one hardly does
+# singular values over the largest, left out: of what no motion shows; of what this one hardly does
+TRUNCATIONS = (1e-6, 1e-2, 3e-2)
 EMPS_CUTOFF, EMPS_DECIMATION = 100.0, 10  # Hz, and samples, of the publishers' relative error (their Script_IDIM_LS.m)
 EMPS_BORDER = 50  # samples left out there at either end
 
 UR10_LOW_PASS = 2.0  # Hz, about: above it the published recording of the UR10 holds nothing
-# figaroh-examples, examples/staubli_TX40 (TX40_config.yaml), joints 1 to 6: Coulomb N m, viscous N m s/rad, motor kg m2.
+# figaroh-examples, examples/staubli_TX40 (TX40_config.yaml), joints 1 to 6: Coulomb N m, viscous N m s/rad, motor kg
+# m2.
 TX40_COULOMB = np.array([7.14, 8.26, 6.34, 2.48, 3.03, 0.28])
 TX40_VISCOUS = np.array([8.05, 5.53, 1.97, 1.11, 1.86, 0.65])
 TX40_MOTOR = np.array([0.362, 0.362, 0.0988, 0.0313, 0.0468, 0.0105])
-TX40_WRIST = np.eye(6) - np.outer(np.eye(6)[5], np.eye(6)[4])  # joints by motors: motor 6 turns by the sum of joints 5 and 6
+# joints by motors: motor 6 turns by the sum of joints 5 and 6
+TX40_WRIST = np.eye(6) - np.outer(np.eye(6)[5], np.eye(6)[4])
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,8 @@ class Motion:
         return (self.lines - 1) * self.rate / self.period
 
     def seen(self, x: np.ndarray) -> np.ndarray:
-        """Signals (N, ...) through window and band: rows of real numbers (2 K - 1, ...) whose squares sum to the mean square."""
+        """Signals (N, ...) through window and band: rows of real numbers (2 K - 1, ...) whose squares sum to the mean
+        square."""
         weighted = x * self.window.reshape(-1, *[1] * (x.ndim - 1))
         X = scipy.fft.rfft(weighted, n=self.period, axis=0, norm="forward")[: self.lines]
         share = np.sum(self.window**2) / self.period
@@ -185,7 +189,8 @@ def columns(model: pin.Model, motion: Motion) -> np.ndarray:
 
 
 def least_squares(y: np.ndarray, X: np.ndarray, truncation: float) -> np.ndarray:
-    """Parameters (P,) of torques y (R, n) that are linear in them by X (R, n, P), joints weighted by what is left at them.
+    """Parameters (P,) of torques y (R, n) that are linear in them by X (R, n, P), joints weighted by what is left at
+    them.
 
     Combinations that the motions do not show stay zero: base parameters, by a singular value decomposition.
     """
@@ -202,8 +207,8 @@ def least_squares(y: np.ndarray, X: np.ndarray, truncation: float) -> np.ndarray
 def predicted(motion: Motion, C: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Torque (N, n) by columns (N, n, P) and parameters (P,).
 
-    Where a joint stands still Coulomb friction is what balances the recorded torque, up to its size, as ``simgap`` has it: the
-    sign of a velocity says nothing there.
+    Where a joint stands still Coulomb friction is what balances the recorded torque, up to its size, as ``simgap`` has
+    it: the sign of a velocity says nothing there.
     """
     n = motion.q.shape[1]
     coulomb = slice(len(p) - 2 * n, len(p) - n)
@@ -213,10 +218,12 @@ def predicted(motion: Motion, C: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def plain(model: pin.Model, given: Sequence[Motion]) -> tuple[Reference, Reference]:
-    """Rigid body with friction, fitted to the motions for identification in the compared band: all of it, and its drives alone.
+    """Rigid body with friction, fitted to the motions for identification in the compared band: all of it, and its
+    drives alone.
 
-    Short motions show base parameters badly; with the bodies as described there is less to fit, and motor inertia, friction and
-    offsets remain. Of several truncations the one that does best on the held-out data themselves is told, which favours it.
+    Short motions show base parameters badly; with the bodies as described there is less to fit, and motor inertia,
+    friction and offsets remain. Of several truncations the one that does best on the held-out data themselves is told,
+    which favours it.
     """
     train = [(m.seen(m.tau), m.seen(columns(model, m))) for m in given if m.role == "identification"]
     tests = [(m, columns(model, m)) for m in given if m.role == "validation"]
@@ -236,10 +243,14 @@ def plain(model: pin.Model, given: Sequence[Motion]) -> tuple[Reference, Referen
             found.append(Reference(name, left(p)))
         return min(found, key=lambda r: r.over_all)
 
-    return best("least squares", none, slice(None)), best("least squares, bodies as described", bodies, slice(len(described), None))
+    return best("least squares", none, slice(None)), best(
+        "least squares, bodies as described", bodies, slice(len(described), None)
+    )
 
 
-def evaluated(name: str, torque: Callable[[Motion], np.ndarray], given: Sequence[Motion], *, centred: bool = False) -> Reference:
+def evaluated(
+    name: str, torque: Callable[[Motion], np.ndarray], given: Sequence[Motion], *, centred: bool = False
+) -> Reference:
     """A model as it stands, by its ``torque`` (N, n) along a motion.
 
     Args:
@@ -258,7 +269,8 @@ def emps_force(motion: Motion) -> np.ndarray:
 
 
 def emps_relative_error(drive: LinearDrive, motion: Motion) -> float:
-    """The publishers' figure of merit, per cent: norm of the error over that of the force, both decimated to 100 samples a second.
+    """The publishers' figure of merit, per cent: norm of the error over that of the force, both decimated to 100
+    samples a second.
 
     Positions are low-passed at 100 Hz without phase and differentiated by central differences, as they do.
     """
@@ -295,9 +307,9 @@ def tx40_torque(model: pin.Model) -> Callable[[Motion], np.ndarray]:
 def tabled_torque(file: Path) -> Callable[[Motion], np.ndarray]:
     """Torque of a published model from a table ``t`` (T,) s, ``torque`` (T, n) N m along a recording.
 
-    For a model whose licence keeps it out of this project: the publishers' own program is run at the ``derivatives`` of the
-    recording, and ``published_torque.npz`` beside it holds what comes out. Of the Panda: mass matrix, Coriolis, gravity and
-    friction vectors of FrankaEmikaPandaDynModel, matlab/dyn_model_panda, commit 24d85ce.
+    For a model whose licence keeps it out of this project: the publishers' own program is run at the ``derivatives`` of
+    the recording, and ``published_torque.npz`` beside it holds what comes out. Of the Panda: mass matrix, Coriolis,
+    gravity and friction vectors of FrankaEmikaPandaDynModel, matlab/dyn_model_panda, commit 24d85ce.
     """
     with np.load(file) as table:
         t, torque = table["t"], table["torque"]

@@ -1,7 +1,8 @@
 """Real machines: import, diagnosis, references and pictures of each data set, written to docs/real-data.md.
 
     python benchmarks/real_data.py --data ../shared/data
-    python benchmarks/real_data.py --references            # published models and plain least squares alone: no diagnosis
+    python benchmarks/real_data.py --references            # published models and plain least squares alone: no
+    diagnosis
 
 Verdicts and figures in that page are what this prints; the words about machines and publishers are below.
 """
@@ -26,9 +27,7 @@ from ident.show.figures import trace_figure
 from ident.units import torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis, Gain
 
-COLOURS = (
-    "<style>svg { --ink: #16181a; --soft: #5c666f; --line: #dfe3e6; --before: #c0492f; --after: #1f6f8b; background: #ffffff }</style>"
-)
+COLOURS = "<style>svg { --ink: #16181a; --soft: #5c666f; --line: #dfe3e6; --before: #c0492f; --after: #1f6f8b; background: #ffffff }</style>"
 PAGE = Path(__file__).parent.parent / "docs" / "real-data.md"
 
 
@@ -84,7 +83,12 @@ MACHINES = (
     Machine(
         "panda_gaz_ral2019",
         "panda_bare",
-        ("exciting_traj_positions.txt", "exciting_traj_time.txt", "exciting_traj_torques.txt", "exciting_traj_velocity.txt"),
+        (
+            "exciting_traj_positions.txt",
+            "exciting_traj_time.txt",
+            "exciting_traj_torques.txt",
+            "exciting_traj_velocity.txt",
+        ),
         "Franka Panda, joint torque sensors",
         "Gaz, Cognetti, Oliva, Robuffo Giordano and De Luca, IEEE RA-L 2019 (GPL-3.0, not shipped). Their model, version 1.0, was evaluated"
         " from their published expressions along this run (its torques are not part of this project); it knows no offsets of the sensors, and is told as it is and with those of the first"
@@ -181,7 +185,15 @@ def comparison(found: Outcome) -> list[str]:
 
 def summary(outcomes: Sequence[Outcome]) -> str:
     """The table at the head of the page."""
-    head = ["data set", "band, Hz", "first model", "published model", "least squares", "extended model", "extended over best reference"]
+    head = [
+        "data set",
+        "band, Hz",
+        "first model",
+        "published model",
+        "least squares",
+        "extended model",
+        "extended over best reference",
+    ]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for found in outcomes:
         gain, plain, unit = found.result.verdict.gain, found.plain, torque_unit(found.result.robot)
@@ -218,14 +230,19 @@ def section(found: Outcome) -> str:
             closed += f" (95 %: {g.ci95[0]:.1%} to {g.ci95[1]:.1%})"
         unit = torque_unit(result.robot)
         of = f" of {', '.join(g.joints)}" if g.of_some else ""
-        lines += [f"Error{of} on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} {unit}{closed}; noise {g.noise_floor:.2g}.", ""]
+        lines += [
+            f"Error{of} on held-out data ({g.method}): {g.before:.4g} → {g.after:.4g} {unit}{closed}; noise {g.noise_floor:.2g}.",
+            "",
+        ]
     lines += comparison(found)
     if v.residual_description:
         lines += [v.residual_description, ""]
     for trace in result.traces[: int(machine.picture)]:
         picture = PAGE.parent / f"{machine.folder}.svg"
         # The figures of the report take their colours from its page.
-        svg = trace_figure(trace, result.joints, torque_units(result.robot), result.verdict.gain.joints).replace('version="1.1">', f'version="1.1">{COLOURS}', 1)
+        svg = trace_figure(trace, result.joints, torque_units(result.robot), result.verdict.gain.joints).replace(
+            'version="1.1">', f'version="1.1">{COLOURS}', 1
+        )
         picture.write_text(svg, encoding="utf-8")
         lines += [f"![Error of the torque on held-out motion, before and after]({picture.name})", ""]
     lines += [f"{found.seconds:.0f} s.", ""]
@@ -248,8 +265,12 @@ HEAD = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--only", default="", help="folders, comma-separated; the page is then printed, not written, and pictures are")
-    parser.add_argument("--references", action="store_true", help="print what the references leave, and diagnose nothing")
+    parser.add_argument(
+        "--only", default="", help="folders, comma-separated; the page is then printed, not written, and pictures are"
+    )
+    parser.add_argument(
+        "--references", action="store_true", help="print what the references leave, and diagnose nothing"
+    )
     parser.add_argument("--max-seconds", type=float, default=600.0)
     args = parser.parse_args()
     only = set(filter(None, args.only.split(",")))
@@ -259,7 +280,11 @@ def main() -> None:
             dataset = converted(machine, args.data)
             plain = references(dataset, args.data / machine.folder)
             if plain is not None:
-                print(f"{machine.title}, 0 to {plain.band_hz:.3g} Hz\n", *table_of(plain, None, torque_unit(dataset.robot)), sep="\n")
+                print(
+                    f"{machine.title}, 0 to {plain.band_hz:.3g} Hz\n",
+                    *table_of(plain, None, torque_unit(dataset.robot)),
+                    sep="\n",
+                )
         return
     outcomes, parts = [], []
     PAGE.parent.mkdir(exist_ok=True)

@@ -33,8 +33,8 @@ def brought_to(stronger: Callable[[float], E], size: Callable[[E], float], targe
 
     The strength ends where no machine has such an effect: one that hardly shows is left small.
 
-    Between a strength that does too little and one that does too much in halves, where the secant leads out of there or to
-    an end: such effects do nothing and all at once, as a limit does that the torque just reaches.
+    Between a strength that does too little and one that does too much in halves, where the secant leads out of there or
+    to an end: such effects do nothing and all at once, as a limit does that the torque just reaches.
 
     Args:
         stronger: the effect with its strength times a factor.
@@ -85,7 +85,8 @@ def _lines(segment: Segment, channel: str) -> np.ndarray:
 
 
 def distortion(change: np.ndarray, drives: np.ndarray, noise: np.ndarray) -> float:
-    """Root mean square over lines and channels of a change that drives cannot make, over the noise; of the segment and joint with most.
+    """Root mean square over lines and channels of a change that drives cannot make, over the noise; of the segment and
+    joint with most.
 
     Args:
         change: (S, K, 2, n) as of ``spectra``.

@@ -55,10 +55,14 @@ from ident.torque_fit import Fit
 
 DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DOUBTED_LEVEL = 1e-2  # the same where the drives that fit cannot be those of this arm
-LEFT_TO_DECOYS = 0.03  # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
-LINEAR_SHARE = 0.5 * MIN_SHARE  # of what is left at a joint, from which a friction is fitted there too: a step at a few shapes shows half of it
-LOOP_SIZES = (1.0, 0.6, 1.6)  # of a law of the gear, over that along the record or found so far, from which its loop is begun
-LAWS_LEAVE = 1e-4  # of what causes explain at a joint, left there by errors of a hundredth in their laws: no other is sought loudly
+# share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
+LEFT_TO_DECOYS = 0.03
+# of what is left at a joint, from which a friction is fitted there too: a step at a few shapes shows half of it
+LINEAR_SHARE = 0.5 * MIN_SHARE
+# of a law of the gear, over that along the record or found so far, from which its loop is begun
+LOOP_SIZES = (1.0, 0.6, 1.6)
+# of what causes explain at a joint, left there by errors of a hundredth in their laws: no other is sought loudly
+LAWS_LEAVE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,8 @@ def attribute(
                 break
             p_detected = p_detected if clear or rounds else by_chance
         workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
-        # What is left beside a cause is mostly what its law lacks, and no hinge unless little is left; what is faint shows none everywhere.
+        # What is left beside a cause is mostly what its law lacks, and no hinge unless little is left; what is faint
+        # shows none everywhere.
         bare = np.inf if rounds or faint else worth_a_hinge(current)
         least = 0.0 if faint else worth_a_refit(current)
         quiet = frozenset() if faint else shadows(problem, current, rounds)
@@ -166,7 +171,8 @@ def attribute(
 
 
 def carried_on(problem: Problem, known: Attribution, workers: Workers) -> tuple[Fit, list[Round]]:
-    """Causes found beside other noise, fitted and weighed beside that of ``problem``: the model, and a round for each."""
+    """Causes found beside other noise, fitted and weighed beside that of ``problem``: the model, and a round for
+    each."""
     current = polish(problem, known.final)
     there = {e.hypothesis.key for e in current.model.effects}
     rounds = []
@@ -178,7 +184,8 @@ def carried_on(problem: Problem, known: Attribution, workers: Workers) -> tuple[
 
 
 def untaken(hypotheses: Sequence[Hypothesis], effects: Sequence[Effect]) -> tuple[Hypothesis, ...]:
-    """Hypotheses that may be sought beside effects: a special case of what is there already would only share its size with it."""
+    """Hypotheses that may be sought beside effects: a special case of what is there already would only share its size
+    with it."""
     taken = {e.hypothesis.key for e in effects}
     taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in effects}
     loaded = any(effect == "payload" for effect, _ in taken)
@@ -194,7 +201,10 @@ def less_errors_of_laws(current: Fit, told: np.ndarray) -> Fit:
     own = [e.hypothesis.joint for e in current.model.effects if not e.hypothesis.on_chain]
     laws = np.zeros(len(told))
     laws[own] = LAWS_LEAVE * np.maximum(told[own], 0.0)
-    return replace(current, costs=np.where(current.costs - current.counts < laws, np.minimum(current.costs, current.counts), current.costs))
+    return replace(
+        current,
+        costs=np.where(current.costs - current.counts < laws, np.minimum(current.costs, current.counts), current.costs),
+    )
 
 
 def as_loops(problem: Problem, current: Fit, workers: Workers) -> Fit:
@@ -215,10 +225,11 @@ def as_loops(problem: Problem, current: Fit, workers: Workers) -> Fit:
 
 
 def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
-    """The model with laws under which the arm may have several steady motions begun from other sizes, where they leave more than noise.
+    """The model with laws under which the arm may have several steady motions begun from other sizes, where they leave
+    more than noise.
 
-    Between two sizes at which a record changes from one motion to another the cost has a minimum each. So has a friction that
-    turns at once, and that turns within a velocity that is seen.
+    Between two sizes at which a record changes from one motion to another the cost has a minimum each. So has a
+    friction that turns at once, and that turns within a velocity that is seen.
     """
     for effect in current.model.effects:
         h, resized, j = effect.hypothesis, effect.hypothesis.options.get("bends"), effect.hypothesis.joint
@@ -235,7 +246,9 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
         workers.say(f"other motions: {h.effect} at {h.place}")
         again = partial(refit, problem, weights=current.weights, remainders=current.remainders)
         fits = workers.map_in_time(again, models)
-        best = min((r for r in fits if r is not None and not last_is_pointless(r)), key=lambda r: r.cost, default=current)
+        best = min(
+            (r for r in fits if r is not None and not last_is_pointless(r)), key=lambda r: r.cost, default=current
+        )
         if best.cost < current.cost - MIN_EVIDENCE:
             current = polish(problem, best)
     return current
@@ -286,7 +299,13 @@ def companions(
     joined = reweighted(problem, last, current.weights)
     by_joint = {s.hypothesis.joint: s for s in kept}
     rounds = [
-        Round(current, (Candidate(e.hypothesis, joined, 0.0, winner.probability),), (by_joint[e.hypothesis.joint],), scale, 1.0)
+        Round(
+            current,
+            (Candidate(e.hypothesis, joined, 0.0, winner.probability),),
+            (by_joint[e.hypothesis.joint],),
+            scale,
+            1.0,
+        )
         for e in last.model.effects
         if e.hypothesis.key not in before
     ]

@@ -1,4 +1,5 @@
-"""The baseline of a diagnosis: the gray-box without causes, fitted from several starts, and whether its drives can be those of the arm."""
+"""The baseline of a diagnosis: the gray-box without causes, fitted from several starts, and whether its drives can be
+those of the arm."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
 LAST_STEPS = 8  # at most, under the noise that the baseline sees itself
 RENEWALS = 3  # at most, of that noise
-SAME_NOISE = 0.05  # natural logarithm of a drive figure, up to which a fit has moved so little that its noise is its own
+# natural logarithm of a drive figure, up to which a fit has moved so little that its noise is its own
+SAME_NOISE = 0.05
 UNDETERMINED = 0.2  # relative standard deviation above which a parameter counts as not determined
 
 
@@ -95,7 +97,8 @@ def astray(problem: Problem, result: Fit) -> np.ndarray:
 
 
 def discrepancy_p_value(result: Fit) -> float:
-    """Probability of a cost this large by noise alone: of all joints, or of the clearest of those that are ``loud`` (Bonferroni).
+    """Probability of a cost this large by noise alone: of all joints, or of the clearest of those that are ``loud``
+    (Bonferroni).
 
     By chi-square (Wilson-Hilferty in the tail).
     """
@@ -111,7 +114,8 @@ def discrepancy_p_value(result: Fit) -> float:
 def loud(result: Fit, told: np.ndarray | float = 0.0) -> np.ndarray:
     """(n,) whether a joint alone leaves clearly more than noise, which all joints together may hide.
 
-    The noise of one joint is known less well than that of all, and laws of causes that are named leave more at their own.
+    The noise of one joint is known less well than that of all, and laws of causes that are named leave more at their
+    own.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.

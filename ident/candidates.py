@@ -162,7 +162,9 @@ def _drop_always_touching(body: Body, robot: Robot, rng: np.random.Generator) ->
     hits = np.zeros(len(body.geometry.collisionPairs))
     low, high = reach(robot)
     for _ in range(TRIALS):
-        pin.computeCollisions(body.model, data, body.geometry, touch, configuration(body, rng.uniform(low, high)), False)
+        pin.computeCollisions(
+            body.model, data, body.geometry, touch, configuration(body, rng.uniform(low, high)), False
+        )
         hits += [result.isCollision() for result in touch.collisionResults]
     always = [p for p, k in zip(list(body.geometry.collisionPairs), hits, strict=True) if k > ALWAYS * TRIALS]
     for pair in always:

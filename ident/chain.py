@@ -146,11 +146,7 @@ def build_structure(
         if change.with_load and name not in known:
             body = sum((x for link, x in placed if parent[link] == i), body)
         model.appendBodyToJoint(carrier[i], change.of(body), pin.SE3.Identity())
-    bodies = {
-        f.name: (carrier[f.parentJoint], f.placement)
-        for f in source.frames
-        if f.type == pin.FrameType.BODY
-    }
+    bodies = {f.name: (carrier[f.parentJoint], f.placement) for f in source.frames if f.type == pin.FrameType.BODY}
     for link, inertia in placed:
         if source.names[parent[link]] not in known and not changed.get(parent[link], LinkChange()).with_load:
             model.appendBodyToJoint(bodies[link][0], inertia, pin.SE3.Identity())
@@ -160,9 +156,7 @@ def build_structure(
         joint_index, placement = bodies[link]
         model.appendBodyToJoint(joint_index, inertia, placement)
     driven = np.array([index[name] for name in robot.joint_names])
-    elastic = np.array(
-        [model.idx_vs[model.getJointId(_hinge_name(h))] for h in hinges], dtype=int
-    )
+    elastic = np.array([model.idx_vs[model.getJointId(_hinge_name(h))] for h in hinges], dtype=int)
     return Structure(
         model,
         driven,
@@ -214,9 +208,7 @@ def _joint_model(joint: pin.JointModel) -> pin.JointModel:
     """The same axis as a joint of one coordinate (a URDF "continuous" joint has two)."""
     kind = joint.shortname()
     prismatic = "JointModelP" in kind
-    axis = np.asarray(
-        joint.extract().axis if "Unaligned" in kind else _AXES.get(kind[-1], (0.0, 0.0, 0.0)), float
-    )
+    axis = np.asarray(joint.extract().axis if "Unaligned" in kind else _AXES.get(kind[-1], (0.0, 0.0, 0.0)), float)
     if not np.any(axis):
         raise DataError("joint", kind, "a joint of several degrees of freedom", "revolute or prismatic")
     return pin.JointModelPrismaticUnaligned(axis) if prismatic else pin.JointModelRevoluteUnaligned(axis)
@@ -226,9 +218,7 @@ def _hinge_name(hinge: Elasticity) -> str:
     return f"elasticity:{hinge.name}"
 
 
-def _add_hinges(
-    model: pin.Model, parent: int, hinges: Sequence[Elasticity], placement: pin.SE3
-) -> tuple[int, pin.SE3]:
+def _add_hinges(model: pin.Model, parent: int, hinges: Sequence[Elasticity], placement: pin.SE3) -> tuple[int, pin.SE3]:
     """The last of a chain of hinges, and where it takes what comes after them."""
     for hinge in hinges:
         axis = np.asarray(hinge.axis, float)

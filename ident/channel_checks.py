@@ -37,7 +37,9 @@ def filled_warnings(s: Segment, dataset: Dataset) -> list[str]:
     if s.filled is None:
         return []
     f, share = s.filled, s.filled.total * dataset.sample_rate / len(s.t)
-    return [f"{f.gaps} gaps of the log, {f.longest:.3g} s the longest, {f.total:.3g} s in all ({share:.2g} of the segment), were filled by interpolation"]
+    return [
+        f"{f.gaps} gaps of the log, {f.longest:.3g} s the longest, {f.total:.3g} s in all ({share:.2g} of the segment), were filled by interpolation"
+    ]
 
 
 def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
@@ -50,17 +52,31 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
         m, newton = ("m", "N") if linear[j] else ("rad", "N m")
         q, tau = s.q[:, j], s.tau[:, j]
         room = robot.q_max[j] - robot.q_min[j]
-        if kinds[name] != "continuous" and (q.max() > robot.q_max[j] + 0.02 * room or q.min() < robot.q_min[j] - 0.02 * room):
-            why = "wrong unit, zero or side of the gear?" if np.ptp(q) <= 1.1 * room else "degrees, millimetres, or the motor side of the gear?"
-            out.append(f"q_{j + 1} ({name}) goes from {q.min():.4g} to {q.max():.4g} {m}, its limits are {robot.q_min[j]:.4g} and {robot.q_max[j]:.4g}: {why}")
+        if kinds[name] != "continuous" and (
+            q.max() > robot.q_max[j] + 0.02 * room or q.min() < robot.q_min[j] - 0.02 * room
+        ):
+            why = (
+                "wrong unit, zero or side of the gear?"
+                if np.ptp(q) <= 1.1 * room
+                else "degrees, millimetres, or the motor side of the gear?"
+            )
+            out.append(
+                f"q_{j + 1} ({name}) goes from {q.min():.4g} to {q.max():.4g} {m}, its limits are {robot.q_min[j]:.4g} and {robot.q_max[j]:.4g}: {why}"
+            )
         fast = float(np.percentile(np.abs(v[:, j]), 99.5))
         if fast > 2 * speeds[j]:
-            out.append(f"q_{j + 1} ({name}) moves at {fast:.4g} {m}/s, its limit is {speeds[j]:.4g}: wrong unit or sample rate?")
+            out.append(
+                f"q_{j + 1} ({name}) moves at {fast:.4g} {m}/s, its limit is {speeds[j]:.4g}: wrong unit or sample rate?"
+            )
         top = float(np.abs(tau).max())
         if top > 3 * limits[j]:
-            out.append(f"tau_{j + 1} ({name}) reaches {top:.4g} {newton}, its limit is {limits[j]:.4g}: wrong unit or side of the gear?")
+            out.append(
+                f"tau_{j + 1} ({name}) reaches {top:.4g} {newton}, its limit is {limits[j]:.4g}: wrong unit or side of the gear?"
+            )
         elif 0 < top < 2e-3 * limits[j]:
-            out.append(f"tau_{j + 1} ({name}) stays below {top:.3g} {newton}, its limit is {limits[j]:.4g}: current, or torque before the gear?")
+            out.append(
+                f"tau_{j + 1} ({name}) stays below {top:.3g} {newton}, its limit is {limits[j]:.4g}: current, or torque before the gear?"
+            )
         for channel, x, reference in (("qd", s.qd, v), ("q_link", s.q_link, s.q), ("q_ref", s.q_ref, s.q)):
             if x is None or not np.all(np.isfinite(x[:, j])) or np.ptp(x[:, j]) == 0:
                 continue
@@ -105,7 +121,9 @@ def stuck_warnings(s: Segment, dataset: Dataset) -> list[str]:
                 moving = len(before) > 0 and len(after) > 0 and min(before.min(), after.max()) > usual
             inside = a > 0 and b < len(x)
             if lengths[k] >= longest and moving and inside:
-                out.append(f"{channel}_{j + 1} ({name}) stands still for {lengths[k] / dataset.sample_rate:.3g} s from {s.t[a]:.4g} s on, in motion")
+                out.append(
+                    f"{channel}_{j + 1} ({name}) stands still for {lengths[k] / dataset.sample_rate:.3g} s from {s.t[a]:.4g} s on, in motion"
+                )
             for top, word in ((x.max(), "above"), (x.min(), "below")):
                 # Saturation comes in runs; a coarse signal meets its extremes here and there.
                 ends = np.isclose(x[starts], top, rtol=0, atol=1e-9 * np.ptp(x)) & (lengths >= 3)
@@ -141,14 +159,17 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
     jumps = int(np.sum(found & ~_recurring(found, s.period)))
     out = []
     if repeated > max(1, 1e-4 * len(rows)):
-        out.append(f"{repeated} samples ({repeated / len(rows):.1%}) repeat the one before in all channels, in motion: lost packets")
+        out.append(
+            f"{repeated} samples ({repeated / len(rows):.1%}) repeat the one before in all channels, in motion: lost packets"
+        )
     if jumps > max(2, 1e-3 * moving.sum()):
         out.append(f"{jumps} double steps of position between samples: dropped samples")
     return out
 
 
 def _recurring(found: np.ndarray, period: int | None) -> np.ndarray:
-    """(N,) whether what was found at a sample is found in half of the periods there: it is of the motion, not of the log."""
+    """(N,) whether what was found at a sample is found in half of the periods there: it is of the motion, not of the
+    log."""
     if period is None or len(found) < 2 * period:
         return np.zeros(len(found), bool)
     place = np.arange(len(found)) % period
@@ -175,13 +196,17 @@ def excitation_warnings(s: Segment, dataset: Dataset) -> list[str]:
     tau_rms = np.maximum(s.tau.std(axis=0), 1e-300)
     smooth = np.flatnonzero((difference_noise(s.tau) < SMOOTH * tau_rms) & (np.ptp(s.tau, axis=0) > 0))
     if len(smooth):
-        out.append(f"no noise is left on the torque of joints {_list(smooth)}: the log was filtered, deviations will come out too small")
+        out.append(
+            f"no noise is left on the torque of joints {_list(smooth)}: the log was filtered, deviations will come out too small"
+        )
     if s.kind != "trajectory":
         # Differences of samples show noise alone where the excitation stays far below the sample rate.
         low = s.period is not None and not np.any(np.asarray(s.excited_lines) > LOW_SHARE * s.period)
         still = np.flatnonzero(s.q.std(axis=0) < MOVES * difference_noise(s.q)) if low else np.zeros(0, int)
         if len(still):
-            out.append(f"joints {_list(still)} hardly move beyond the noise of their position: nothing is learnt of them")
+            out.append(
+                f"joints {_list(still)} hardly move beyond the noise of their position: nothing is learnt of them"
+            )
         return out
     v = velocity(s, rate)
     speeds = robot.array("velocity_limit")
@@ -191,7 +216,9 @@ def excitation_warnings(s: Segment, dataset: Dataset) -> list[str]:
     turns = np.array([_reversals(v[:, j], 0.05 * np.abs(v[:, j]).max()) for j in range(dataset.n)])
     few = np.flatnonzero((turns < 1) & ~np.isin(np.arange(dataset.n), slow))
     if len(few):
-        out.append(f"joints {_list(few)} move in one direction only: their friction cannot be told from gravity and offsets")
+        out.append(
+            f"joints {_list(few)} move in one direction only: their friction cannot be told from gravity and offsets"
+        )
     top, anti = highest_frequency(s, rate), anti_resonance(s, robot)
     still = np.flatnonzero(top < 0.3 * anti)
     if len(still):
@@ -206,7 +233,9 @@ def excitation_warnings(s: Segment, dataset: Dataset) -> list[str]:
 def highest_frequency(s: Segment, rate: float) -> np.ndarray:
     """(n,) highest frequency, Hz, at which the position stands ten times above its noise."""
     n = min(len(s.q), 1 << int(np.log2(len(s.q))), 8192)
-    f, P = scipy.signal.welch(s.q - s.q.mean(axis=0), rate, nperseg=n, axis=0, detrend="linear", window="blackmanharris")
+    f, P = scipy.signal.welch(
+        s.q - s.q.mean(axis=0), rate, nperseg=n, axis=0, detrend="linear", window="blackmanharris"
+    )
     floor = 10 * np.maximum(2 * difference_noise(s.q) ** 2 / rate, np.median(P[-max(4, len(f) // 10) :], axis=0))
     out = []
     for j in range(P.shape[1]):

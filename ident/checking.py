@@ -25,7 +25,16 @@ from ident.skew_checks import skew_warnings
 from ident.torque_checks import torque_warnings
 from robot_assets.robot import linear_joints
 
-CHECKS = (filled_warnings, period_warnings, unit_warnings, stuck_warnings, lost_sample_warnings, skew_warnings, excitation_warnings, torque_warnings)
+CHECKS = (
+    filled_warnings,
+    period_warnings,
+    unit_warnings,
+    stuck_warnings,
+    lost_sample_warnings,
+    skew_warnings,
+    excitation_warnings,
+    torque_warnings,
+)
 MOST = 40  # warnings shown
 SHOWN = 12  # segments listed one by one
 BRIEF = 5.0  # s of motion in all, below which inertia, gravity and friction hardly get apart
@@ -75,7 +84,10 @@ class Report:
         rows = [
             f"{self.name}: {self.robot}, {n} joints at {self.sample_rate:g} Hz, {self.duration:.4g} s; {kinds}",
             f"understood: SI units on the link side of the gear; torque {hold}",
-            "channels: " + ", ".join(c if len(j) == n else f"{c} of joints {', '.join(map(str, j))}" for c, j in self.channels.items()),
+            "channels: "
+            + ", ".join(
+                c if len(j) == n else f"{c} of joints {', '.join(map(str, j))}" for c, j in self.channels.items()
+            ),
         ]
         if self.operating_points:
             rows.append(
@@ -166,7 +178,9 @@ def _partial(dataset: Dataset) -> list[str]:
         some = [j + 1 for j in range(dataset.n) if 0 < counts[j] < all_of_them]
         if some:
             most = max(counts[j - 1] for j in some)
-            out.append(f"{channel} of joint{'s' if len(some) > 1 else ''} {', '.join(map(str, some))} in {most} of {all_of_them} segments only")
+            out.append(
+                f"{channel} of joint{'s' if len(some) > 1 else ''} {', '.join(map(str, some))} in {most} of {all_of_them} segments only"
+            )
     return out
 
 
@@ -211,7 +225,9 @@ def _brief_warnings(dataset: Dataset) -> list[str]:
     seconds = sum(s.n_samples for s in fitted) / dataset.sample_rate
     if seconds >= BRIEF:
         return []
-    return [f"{seconds:.3g} s of motion to fit in all, less than {BRIEF:g} s: inertia, gravity and friction hardly get apart, and causes even less"]
+    return [
+        f"{seconds:.3g} s of motion to fit in all, less than {BRIEF:g} s: inertia, gravity and friction hardly get apart, and causes even less"
+    ]
 
 
 def _joint(warning: str) -> str:

@@ -99,14 +99,22 @@ def _plan(robot, points: int, realizations: int, seed: int, levels: tuple[float,
 def experiment(
     robot: str,
     out: Out,
-    effect: Annotated[list[str] | None, typer.Option("--effect", help="NAME@PLACE:key=value,...; several hide several.")] = None,
+    effect: Annotated[
+        list[str] | None, typer.Option("--effect", help="NAME@PLACE:key=value,...; several hide several.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of excitation, noise and drives.")] = 0,
     realizations: Annotated[int, typer.Option(min=1, max=1000)] = 1,
     points: Annotated[int, typer.Option(min=1, max=1000, help="Operating points for identification.")] = 2,
     drives: Annotated[str, typer.Option(help='"nominal", or "drawn" within a factor of two.')] = "nominal",
-    plan: Annotated[Path | None, typer.Option(help="A plan written by `simgap design`, or next_plan.toml of a diagnosis.")] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="A plan written by `simgap design`, or next_plan.toml of a diagnosis.")
+    ] = None,
     one_recording: Annotated[
-        bool, typer.Option("--one-recording", help="All operating points in one run, moves between them included; cut into the dataset.")
+        bool,
+        typer.Option(
+            "--one-recording",
+            help="All operating points in one run, moves between them included; cut into the dataset.",
+        ),
     ] = False,
     json_: Json = False,
     quiet: Quiet = False,
@@ -175,7 +183,9 @@ def frf(
     _check_out(out)
     summary = write_frf(data, out, estimator)
     spare = summary["not_used"]
-    without = f"; not used: {len(spare)} segments in sets of fewer experiments than inputs, {spare[0]} first" if spare else ""
+    without = (
+        f"; not used: {len(spare)} segments in sets of fewer experiments than inputs, {spare[0]} first" if spare else ""
+    )
     _print(summary, json_, f"FRFs of {len(summary['operating_points'])} operating points in {out}{without}")
 
 
@@ -206,7 +216,9 @@ def design(
     points: Annotated[int, typer.Option(min=1, max=1000, help="Operating points for identification.")] = 15,
     candidates: Annotated[int, typer.Option(min=1, max=1_000_000, help="Postures to choose from.")] = 8000,
     criterion: Annotated[str, typer.Option(help="D, A or E.")] = "D",
-    draws: Annotated[int, typer.Option(min=1, max=1000, help="Of the parameters from a prior; 1: the nominal ones.")] = 1,
+    draws: Annotated[
+        int, typer.Option(min=1, max=1000, help="Of the parameters from a prior; 1: the nominal ones.")
+    ] = 1,
     level: Annotated[list[float] | None, typer.Option(help="Excitation level; several, largest first.")] = None,
     realizations: Annotated[int, typer.Option(min=1, max=1000)] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of candidates and excitation.")] = 0,
@@ -228,7 +240,9 @@ def diagnose(
     dataset: Path,
     out: Out,
     max_causes: Annotated[int, typer.Option(min=0)] = 4,
-    max_seconds: Annotated[float, typer.Option(min=0.0, help="After which no further search for causes begins.")] = 600.0,
+    max_seconds: Annotated[
+        float, typer.Option(min=0.0, help="After which no further search for causes begins.")
+    ] = 600.0,
     executor: Annotated[
         str, typer.Option(help="Where candidates are fitted: threads, processes, processes:N or dask://HOST:PORT.")
     ] = "threads",
@@ -253,7 +267,9 @@ def diagnose(
 @app.command()
 def demo(
     out: Out,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the hidden effect and everything else; drawn where absent.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Of the hidden effect and everything else; drawn where absent.")
+    ] = None,
     real: Annotated[str | None, typer.Option(help="Diagnose shipped real data instead, by name.")] = None,
     json_: Json = False,
     quiet: Quiet = False,
@@ -279,7 +295,12 @@ def demo(
     with _progress(quiet or json_) as (say, share):
         say(f"seed {seed}: simulating the plant with a hidden effect")
         data = run_experiment(
-            _plan(arm, 2, 1, seed, (1.0, 0.5, 0.25)), [hidden], seed=seed, drives=figures, name=f"demo-{seed}", progress=share
+            _plan(arm, 2, 1, seed, (1.0, 0.5, 0.25)),
+            [hidden],
+            seed=seed,
+            drives=figures,
+            name=f"demo-{seed}",
+            progress=share,
         )
         with tempfile.TemporaryDirectory() as folder:
             save_dataset(data, Path(folder) / "dataset")
@@ -323,7 +344,9 @@ def _demo_real(name: str, out: Path, json_: bool, quiet: bool) -> None:
 def robot_folder(
     urdf: Path,
     out: Out,
-    lock: Annotated[list[str] | None, typer.Option("--lock", help="JOINT or JOINT=POSITION: does not move; several lock several.")] = None,
+    lock: Annotated[
+        list[str] | None, typer.Option("--lock", help="JOINT or JOINT=POSITION: does not move; several lock several.")
+    ] = None,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -339,7 +362,10 @@ def robot_folder(
             raise DataError("--lock", "command line", entry, "JOINT or JOINT=POSITION") from err
     made, warnings = write_robot(urdf, out, locked)
     rows = [f"{made.n} driven joints in {out / 'robot.toml'}; edit the figures marked GUESS"]
-    rows += [f"  {j.name}: {j.torque_limit:.4g} torque limit, {j.motor_inertia:.3g} motor inertia, {j.stiffness:.3g} stiffness" for j in made.joints]
+    rows += [
+        f"  {j.name}: {j.torque_limit:.4g} torque limit, {j.motor_inertia:.3g} motor inertia, {j.stiffness:.3g} stiffness"
+        for j in made.joints
+    ]
     result = {"robot": str(out), "joints": list(made.joint_names), "locked": made.locked, "warnings": list(warnings)}
     _print(result, json_, "\n".join([*rows, *(f"warning: {w}" for w in warnings)]))
 
@@ -348,9 +374,16 @@ def robot_folder(
 def convert(
     files: list[Path],
     robot: Annotated[str, typer.Option(help="A name in robot_assets or a robot folder.")],
-    map_: Annotated[Path, typer.Option("--map", help="Which columns hold what: a file, or a shipped map by name; with --guess, the file to write.")],
+    map_: Annotated[
+        Path,
+        typer.Option(
+            "--map", help="Which columns hold what: a file, or a shipped map by name; with --guess, the file to write."
+        ),
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="Where to write the dataset.")] = None,
-    guess: Annotated[bool, typer.Option("--guess", help="Write a first map to edit, from names, shapes and ranges.")] = False,
+    guess: Annotated[
+        bool, typer.Option("--guess", help="Write a first map to edit, from names, shapes and ranges.")
+    ] = False,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -397,7 +430,12 @@ def _guess(files: list[Path], robot: str, out: Path, json_: bool, quiet: bool) -
     rows += [f"  {channel}: {what}" for channel, what in guessed.found.items()]
     rows += [f"warning: {text}" for text in guessed.warnings]
     rows += [f"warning: nothing looks like {channel}: name it in the map" for channel in guessed.missing]
-    result = {"map": str(out), "found": guessed.found, "missing": list(guessed.missing), "warnings": list(guessed.warnings)}
+    result = {
+        "map": str(out),
+        "found": guessed.found,
+        "missing": list(guessed.missing),
+        "warnings": list(guessed.warnings),
+    }
     _print(result, json_, "\n".join(rows))
 
 
@@ -443,7 +481,9 @@ def _verdict_text(diagnosis: Diagnosis, out: Path) -> str:
         of = f" at {', '.join(g.joints)}" if g.of_some else ""
         over_all = f"; of all joints {g.over_all[0]:.4g} -> {g.over_all[1]:.4g}" if g.of_some else ""
         unit = torque_unit(diagnosis.robot, g.joints)
-        lines.append(f"Torque error on held-out data{of}: {g.before:.4g} -> {g.after:.4g} {unit}, noise {g.noise_floor:.4g}{over_all}")
+        lines.append(
+            f"Torque error on held-out data{of}: {g.before:.4g} -> {g.after:.4g} {unit}, noise {g.noise_floor:.4g}{over_all}"
+        )
     lines.append(f"Unexplained: {verdict.unexplained_verdict} ({verdict.unexplained_share:.2%})")
     if verdict.residual_description:
         lines.append(verdict.residual_description)

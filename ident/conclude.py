@@ -50,7 +50,9 @@ def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:
     std = np.sqrt(np.maximum(np.diag(result.covariance())[:m], 0.0))
     names = result.names[:m]
     linear = linear_names(result.model.structure.robot)
-    values = {n: Value(float(v), float(v * s), parameter_unit(n, linear)) for n, v, s in zip(names, x, std, strict=True)}
+    values = {
+        n: Value(float(v), float(v * s), parameter_unit(n, linear)) for n, v, s in zip(names, x, std, strict=True)
+    }
     return values, tuple(n for n, s in zip(names, std, strict=True) if not s < UNDETERMINED)
 
 
@@ -94,7 +96,11 @@ def conclude(
         found = rounds[effect.hypothesis.key]
         trust = known_probability(left_of(effect.hypothesis, result), doubted)
         trust *= explained_share(found, final)
-        doubtful = pointless(effect, final.model.par.stiffness[effect.hypothesis.joint]) or too_fast(problem, last, effect) or shadowed(found, result.rounds)
+        doubtful = (
+            pointless(effect, final.model.par.stiffness[effect.hypothesis.joint])
+            or too_fast(problem, last, effect)
+            or shadowed(found, result.rounds)
+        )
         if doubtful or effect.hypothesis.key in belied or not shown(effect, final, covariance):
             trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
@@ -148,7 +154,8 @@ def named_effects(final: Fit) -> tuple[Effect, ...]:
 
 
 def extended_baseline(final: Fit, covariance: np.ndarray) -> dict[str, Value]:
-    """What the baseline holds beyond the drives: offsets of the torque records, friction of links; each of one parameter."""
+    """What the baseline holds beyond the drives: offsets of the torque records, friction of links; each of one
+    parameter."""
     return {
         f"{e.hypothesis.options['baseline']}.{e.hypothesis.place}": value
         for e in final.model.effects
@@ -203,11 +210,14 @@ def faint_note(result: Attribution) -> tuple[str, ...]:
 
 def few_note(final: Fit) -> tuple[str, ...]:
     """Why no name is trusted that is told by next to no data, in a sentence."""
-    return (f"{final.count} numbers were compared and {len(final.names)} parameters fitted to them: too few for any name to be sure.",)
+    return (
+        f"{final.count} numbers were compared and {len(final.names)} parameters fitted to them: too few for any name to be sure.",
+    )
 
 
 def drift_note(problem: Problem) -> tuple[str, ...]:
-    """What does not repeat from period to period, and is no noise of samples, in a sentence; nothing where nothing does."""
+    """What does not repeat from period to period, and is no noise of samples, in a sentence; nothing where nothing
+    does."""
     names = problem.structure.robot.joint_names
     joints = [name for name, x in zip(names, drifting(problem.groups), strict=True) if x]
     if not joints:
@@ -263,9 +273,7 @@ def _late(late: LinkDelay, joint: str) -> Cause:
     )
 
 
-def _cause(
-    effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float
-) -> Cause:
+def _cause(effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float) -> Cause:
     h = effect.hypothesis
     joints = h.options.get("joints", ())
     same = [c for c in candidates if c.hypothesis.key == h.key and c.hypothesis.options.get("joints", ()) == joints]
@@ -349,7 +357,11 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
         return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
     names = " and ".join(_said(c.effect, c.joint, c.probability) for c in sure)
     of_torque = any(c.channel != "q_link" and c.effect != "encoder_quantization" for c in sure)
-    closed = "" if gain is None or gain.gap_closed is None or not of_torque else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
+    closed = (
+        ""
+        if gain is None or gain.gap_closed is None or not of_torque
+        else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
+    )
     rest = ", and an unknown cause remains" if unknown else f"; not for sure {possible}" if possible else ""
     return f"The simulation misses {names}{closed}{rest}."
 

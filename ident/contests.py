@@ -42,10 +42,9 @@ ALIKE = (  # pairs that are hard to tell apart beside a cause that is missing
 )
 
 
-def weighed_again(
-    problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers
-) -> tuple[Fit, list[Round]]:
-    """``rematched``, and the model pruned where a rival has won: alone it may explain what the loser did beside others."""
+def weighed_again(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> tuple[Fit, list[Round]]:
+    """``rematched``, and the model pruned where a rival has won: alone it may explain what the loser did beside
+    others."""
     found, rounds = rematched(problem, current, rounds, workers)
     return found if found is current else pruned(problem, found), rounds
 
@@ -67,7 +66,8 @@ def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: 
 
 
 def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> tuple[Fit, Round]:
-    """The winner of a round and its rivals, each fitted in its place: the model with the best of them, and the round."""
+    """The winner of a round and its rivals, each fitted in its place: the model with the best of them, and the
+    round."""
     effects = current.model.effects
     there = {e.hypothesis.key for e in effects}
     winner = found.candidates[0].hypothesis
@@ -81,7 +81,9 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
 
     rivals = [c.fit.model.effects[-1] for c in found.candidates[1:] if c.probability > REMATCH and other(c.hypothesis)]
     rivals = [e for _, e in best_named([(e.hypothesis, e) for e in rivals], FINALISTS, FINALISTS)]
-    rivals += [e for e in alike(found, winner) if other(e.hypothesis) and all(e.hypothesis is not x.hypothesis for x in rivals)]
+    rivals += [
+        e for e in alike(found, winner) if other(e.hypothesis) and all(e.hypothesis is not x.hypothesis for x in rivals)
+    ]
     rivals += [*as_load(current, own, others), *elsewhere(problem, current, own, others)]
     rivals += wider(problem, current, own) if nearly_settled(current) else []
 
@@ -123,7 +125,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
 
 
 def best_of_each(ran: Sequence[Candidate]) -> list[Candidate]:
-    """The best fit of every name. A body with its load and without keep one each: as good, they may ask for very different changes."""
+    """The best fit of every name. A body with its load and without keep one each: as good, they may ask for very
+    different changes."""
     best: dict[tuple[tuple[str, str], bool], Candidate] = {}
     for c in sorted(ran, key=lambda c: c.fit.cost):
         best.setdefault((c.hypothesis.key, c.hypothesis.options.get("with_load", False)), c)
@@ -138,15 +141,21 @@ def in_reach(ran: Sequence[Candidate]) -> list[Candidate]:
 
 
 def same_as_special(candidate: Candidate, ran: Collection[tuple[str, str]]) -> bool:
-    """Whether a candidate is but the special case that it holds, which ran too: a cable that does not rub beside a spring."""
+    """Whether a candidate is but the special case that it holds, which ran too: a cable that does not rub beside a
+    spring."""
     h = candidate.hypothesis
     return (h.options.get("absorbs"), h.place) in ran and untold(candidate.fit, candidate.fit.model.effects[-1])
 
 
 def alike(found: Round, winner: Hypothesis) -> list[Effect]:
-    """Effects at the joint of a winner that are hard to tell from it, as they were screened: the round may not have tried them."""
+    """Effects at the joint of a winner that are hard to tell from it, as they were screened: the round may not have
+    tried them."""
     twins = {e for pair in ALIKE if winner.effect in pair for e in pair - {winner.effect}}
-    scores = [s for s in found.scores if s.hypothesis.effect in twins and s.hypothesis.joint == winner.joint and s.start is not None]
+    scores = [
+        s
+        for s in found.scores
+        if s.hypothesis.effect in twins and s.hypothesis.joint == winner.joint and s.start is not None
+    ]
     return [Effect(s.hypothesis, clip_to_bounds(s.hypothesis, s.start)) for s in scores[:1]]
 
 
@@ -164,10 +173,13 @@ def as_load(current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]
 
 
 def elsewhere(problem: Problem, current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:
-    """A ripple as it is screened beside all others: found beside causes that were missing its wave number may be another one's."""
+    """A ripple as it is screened beside all others: found beside causes that were missing its wave number may be
+    another one's."""
     if not own.hypothesis.repeats:
         return []
-    without = refit(problem, replace(current.model, effects=tuple(others)), current.weights, current.remainders, FIRST_STEPS)
+    without = refit(
+        problem, replace(current.model, effects=tuple(others)), current.weights, current.remainders, FIRST_STEPS
+    )
     if without is None:
         return []
     preds = predictions(problem, without.model, without.remainders)
@@ -178,7 +190,8 @@ def elsewhere(problem: Problem, current: Fit, own: Effect, others: Sequence[Effe
 
 
 def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
-    """Laws of the catalogue that hold an effect as a special case, at several shapes: a linear step may not lead there."""
+    """Laws of the catalogue that hold an effect as a special case, at several shapes: a linear step may not lead
+    there."""
     h = effect.hypothesis
     there = {e.hypothesis.key for e in current.model.effects}
     laws = [

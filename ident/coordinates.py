@@ -1,4 +1,5 @@
-"""Fitted coordinates of a model: drives as logarithms, timing, effects as their hypotheses say; their names, prior and steps."""
+"""Fitted coordinates of a model: drives as logarithms, timing, effects as their hypotheses say; their names, prior and
+steps."""
 
 from __future__ import annotations
 
@@ -72,7 +73,8 @@ def shifts_posture(model: Model) -> bool:
 
 
 def moves_geometry(effect: Effect, motion: bool) -> bool:
-    """Whether an effect changes the geometric remainder to first order: a change of the arm, and along a motion an error of the position
+    """Whether an effect changes the geometric remainder to first order: a change of the arm, and along a motion an
+    error of the position
     or a law of a gear, which shift gravity and inertia with them."""
     return effect.hypothesis.channel == "model" or (motion and effect.hypothesis.channel in ("position", "spring"))
 

@@ -44,7 +44,8 @@ def noise_costs(problem: Problem, noise: Weights, weights: Weights) -> np.ndarra
 
 
 def has_scatter(problem: Problem, model: Model) -> bool:
-    """Whether the scatter between periods tells what noise adds to the normal equations; along the record it does not."""
+    """Whether the scatter between periods tells what noise adds to the normal equations; along the record it does
+    not."""
     return all(g.scatter is not None and not joints_along_record(model, g) for g in problem.groups)
 
 
@@ -77,8 +78,8 @@ def noise_of(problem: Problem, preds: Sequence[Prediction], weights: Weights, la
 def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
     """(n,) costs by joint as they would be with as much noise as the model of the weights passes on.
 
-    A model that passes on less of the noise of the position, as one that is damped at its resonances does, costs less however wrong
-    it is: that is no merit, and is made up for.
+    A model that passes on less of the noise of the position, as one that is damped at its resonances does, costs less
+    however wrong it is: that is no merit, and is made up for.
     """
     costs = joint_costs(problem, preds, weights)
     if not problem.scatter_share or weights.by_noise is None or not has_scatter(problem, preds[0].model):
@@ -89,7 +90,8 @@ def fair_costs(problem: Problem, preds: Sequence[Prediction], weights: Weights) 
 
 
 def absorbed(problem: Problem, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
-    """(n,) what noise would add to the costs at motors that dry friction holds, which takes it: no merit of the friction."""
+    """(n,) what noise would add to the costs at motors that dry friction holds, which takes it: no merit of the
+    friction."""
 
     def of_group(of: tuple[Group, Prediction, np.ndarray]) -> np.ndarray:
         group, pred, whiten = of

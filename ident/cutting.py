@@ -86,7 +86,12 @@ def schedule_plan(plan: Plan, *, settle: float = SETTLE) -> Schedule:
         elif at is None:
             add("settle", start + rest)
         if isinstance(item, Experiment):
-            add("experiment", np.repeat(start[None], x.period * x.periods, axis=0), np.tile(item.r, (x.periods, 1)), item)
+            add(
+                "experiment",
+                np.repeat(start[None], x.period * x.periods, axis=0),
+                np.tile(item.r, (x.periods, 1)),
+                item,
+            )
         else:
             add("trajectory", item.q_ref, source=item)
         at = end
@@ -96,9 +101,14 @@ def schedule_plan(plan: Plan, *, settle: float = SETTLE) -> Schedule:
 def usage(schedule: Schedule) -> Usage:
     """What the samples of a recording are spent on."""
     x = schedule.plan.excitation
-    spent = {kind: sum(p.stop - p.start for p in schedule.parts if p.kind == kind) for kind in ("move", "settle", "experiment", "trajectory")}
+    spent = {
+        kind: sum(p.stop - p.start for p in schedule.parts if p.kind == kind)
+        for kind in ("move", "settle", "experiment", "trajectory")
+    }
     transients = sum(x.transient_periods * x.period for p in schedule.parts if p.kind == "experiment")
-    return Usage(x.sample_rate, spent["move"], spent["settle"], transients, spent["experiment"] - transients, spent["trajectory"])
+    return Usage(
+        x.sample_rate, spent["move"], spent["settle"], transients, spent["experiment"] - transients, spent["trajectory"]
+    )
 
 
 def cut_recording(recording: Dataset, schedule: Schedule) -> Dataset:
@@ -132,7 +142,9 @@ def _segment(whole: Segment, schedule: Schedule, part: Part, source: Experiment 
     worst = int(np.argmax(off))
     if not off[worst] < OFF_POSTURE:
         found = f"q_{worst + 1} on average {off[worst]:.3g} off the planned posture"
-        raise DataError("posture", f"{source.name}, samples {part.start} to {part.stop}", found, f"less than {OFF_POSTURE:g}")
+        raise DataError(
+            "posture", f"{source.name}, samples {part.start} to {part.stop}", found, f"less than {OFF_POSTURE:g}"
+        )
     channels = whole.part(part.samples)
     # Motions and excitation of the whole recording stand in the plan; what was injected may be better known.
     channels.pop("q_ref", None)

@@ -113,6 +113,4 @@ class Dataset:
 
     def select(self, *, role: str | None = None, kind: str | None = None) -> tuple[Segment, ...]:
         """Segments of a role and kind, in order."""
-        return tuple(
-            s for s in self.segments if role in (None, s.role) and kind in (None, s.kind)
-        )
+        return tuple(s for s in self.segments if role in (None, s.role) and kind in (None, s.kind))

@@ -100,7 +100,9 @@ def check_target(path: str | Path) -> Path:
         raise DataError("output", str(path), "a file", "a new folder or a dataset")
     foreign = [p.name for p in target.iterdir() if not _of_dataset(p)] if target.is_dir() else []
     if foreign:
-        raise DataError("output", str(path), f"{min(foreign)}, which is no part of a dataset", "a new folder or a dataset")
+        raise DataError(
+            "output", str(path), f"{min(foreign)}, which is no part of a dataset", "a new folder or a dataset"
+        )
     return target
 
 
@@ -117,7 +119,9 @@ def save_dataset(dataset: Dataset, path: str | Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     except OSError as err:
-        raise DataError("output", str(path), err.strerror or "a place that cannot be made", "a folder that can be written") from err
+        raise DataError(
+            "output", str(path), err.strerror or "a place that cannot be made", "a folder that can be written"
+        ) from err
     try:
         for segment in dataset.segments:
             pq.write_table(_table(segment), beside / f"{segment.name}.parquet", compression="zstd")
@@ -131,7 +135,9 @@ def check_segment_name(name: str, where: str) -> None:
     """Raise a DataError where a segment could not be a file of its name inside a folder."""
     file = f"{name}.parquet"
     if not name.isprintable() or "/" in name or "\\" in name or len(file.encode(errors="replace")) > LONGEST_NAME:
-        raise DataError("name of a segment", where, ascii(name), f"printable, without slashes, at most {LONGEST_NAME - 8} bytes")
+        raise DataError(
+            "name of a segment", where, ascii(name), f"printable, without slashes, at most {LONGEST_NAME - 8} bytes"
+        )
 
 
 def _of_dataset(path: Path) -> bool:
@@ -189,7 +195,9 @@ def _table(segment: Segment) -> pa.Table:
         x = getattr(segment, channel)
         if x is not None:
             columns |= {
-                f"{channel}_{j + 1}": x[:, j] for j in range(x.shape[1]) if channel != "q_link" or not np.all(np.isnan(x[:, j]))
+                f"{channel}_{j + 1}": x[:, j]
+                for j in range(x.shape[1])
+                if channel != "q_link" or not np.all(np.isnan(x[:, j]))
             }
     return pa.table({k: np.ascontiguousarray(v, float) for k, v in columns.items()})
 
@@ -225,7 +233,9 @@ def _segment(entry: dict, i: int, folder: Path, toml: str, n: int, rate: float, 
     if transient >= periods:
         raise DataError("transient_periods", where, str(transient), f"less than periods = {periods}")
     if len(t) != period * periods:
-        raise DataError("samples", str(path), f"{len(t)}", f"period * periods = {period} * {periods} = {period * periods}")
+        raise DataError(
+            "samples", str(path), f"{len(t)}", f"period * periods = {period} * {periods} = {period * periods}"
+        )
     return Segment(
         **common,
         period=period,

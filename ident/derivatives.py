@@ -32,8 +32,8 @@ def jacobian(
     """Derivative of the predicted outputs by the fitted coordinates, at the lines that are compared.
 
     Args:
-        exact: what moves the links moves the torques of all laws of the gears and the geometric remainder. Both are held
-            without, which beside such laws ends short of the minimum, and tells of less spread than there is.
+        exact: what moves the links moves the torques of all laws of the gears and the geometric remainder. Both are
+            held without, which beside such laws ends short of the minimum, and tells of less spread than there is.
         shifts: what moves the arm to another posture moves all lines, to first order, where the remainder is held.
     """
     m = len(model.par.to_log())
@@ -87,7 +87,10 @@ def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps
 
 def _sagging(columns: Columns, pred: Prediction, posture: np.ndarray) -> dict[int, np.ndarray]:
     """Columns of the stiffness of gears that also let the arm sag to another posture."""
-    sag = pred.plane.A_inv[0][:, pred.structure.driven].real * (pred.par.stiffness * pred.solution.delta[:, 0].real)[:, None]
+    sag = (
+        pred.plane.A_inv[0][:, pred.structure.driven].real
+        * (pred.par.stiffness * pred.solution.delta[:, 0].real)[:, None]
+    )
     held = columns.products.pick(np.arange(sag.shape[-1])).dense()
     return dict(enumerate(np.moveaxis(held + posture @ sag[:, None], -1, 0)))
 
@@ -96,7 +99,8 @@ def _change(group: Group, there: Prediction, base: Prediction, posture: np.ndarr
     """(S, K, n + M) change of the compared outputs between predictions with one geometric remainder.
 
     Args:
-        posture: of ``moved_by_posture`` at the compared lines, which stands for what the remainder would do; None holds it.
+        posture: of ``moved_by_posture`` at the compared lines, which stands for what the remainder would do; None holds
+            it.
     """
     change = (there.outputs(group) - base.outputs(group))[:, : compared_lines(group)]
     if posture is None:
@@ -116,7 +120,8 @@ def _differences(
     exact: bool,
     posture: np.ndarray | None,
 ) -> dict[int, np.ndarray]:
-    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` and along motions the links, by differences.
+    """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` and along motions the links, by
+    differences.
 
     These laws move with the gear's spring and damper; and where the recorded torque says its deflection, with what
     the motor takes of that, and with the timing.
@@ -138,7 +143,9 @@ def _differences(
     def column(c: int, step: float) -> np.ndarray:
         there = unpack(model, x + step * (np.arange(len(x)) == c), np.inf)
         again = exact or c in anew
-        return _change(group, _again(problem, there, group, pred, int(again)), remade if again else pred, posture) / step
+        return (
+            _change(group, _again(problem, there, group, pred, int(again)), remade if again else pred, posture) / step
+        )
 
     return {c: column(c, step) for c, step in steps.items()}
 
@@ -179,7 +186,8 @@ def _effect_columns(
     exact: bool,
     posture: np.ndarray | None,
 ) -> list[np.ndarray]:
-    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``: none by those that the group does not feel.
+    """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``: none by those that the
+    group does not feel.
 
     Args:
         remade: as of ``_differences``.
@@ -203,7 +211,8 @@ def _effect_differences(
     exact: bool,
     posture: np.ndarray | None,
 ) -> list[np.ndarray]:
-    """Change (S, K, n + M) of the predicted outputs by each of some ``steps`` of an effect, over its size; else as ``_effect_columns``."""
+    """Change (S, K, n + M) of the predicted outputs by each of some ``steps`` of an effect, over its size; else as
+    ``_effect_columns``."""
     h, top = effect.hypothesis, compared_lines(group)
     if h.channel == "motor" and not joints_along_record(model, group):
         return [column[:, :top] for column in _motor_columns(model, group, pred, effect, steps)]
@@ -268,6 +277,7 @@ def normal_equations(
     Args:
         columns: derivatives of the outputs of each group by the coordinates of the fit.
     """
+
     def of_group(g: int) -> tuple[np.ndarray, np.ndarray]:
         group = problem.groups[g]
         error = output_error(group, preds[g])

@@ -278,7 +278,9 @@ def _check_seen(H: np.ndarray, names: tuple[str, ...] | None, where: str) -> Non
     d = int(np.argmin(value[:, 0]))
     if not np.all(np.isfinite(value)) or value[d, 0] < SINGULAR:
         worst = int(np.argmax(np.abs(vector[d, :, 0])))
-        raise DataError("parameters", where, f"nothing seen of {names[worst] if names else worst}", "a band that shows it")
+        raise DataError(
+            "parameters", where, f"nothing seen of {names[worst] if names else worst}", "a band that shows it"
+        )
 
 
 def _inverse(M: np.ndarray) -> np.ndarray:
@@ -387,7 +389,9 @@ def _program(rows: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], floa
         method="highs",
     )
     if result.x is None:
-        raise DataError("E-optimal weights", "design", result.message, "a solvable linear program; try criterion D or A")
+        raise DataError(
+            "E-optimal weights", "design", result.message, "a solvable linear program; try criterion D or A"
+        )
     mu = np.split(-result.ineqlin.marginals / np.concatenate(size), np.cumsum([len(b) for b in blocks])[:-1])
     mu = [np.maximum(m, 0) / max(np.maximum(m, 0).sum(), 1e-300) for m in mu]
     return result.x[:A], mu, float(unit * result.x[A:].sum())

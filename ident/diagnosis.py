@@ -35,9 +35,13 @@ from ident.trust import LEFT_ERROR, denied, known_probability
 from ident.units import torque_unit, units_of_torques
 from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
 
-LEFT_BY_BOTH = 0.1  # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
-SETTLED_BY_INERTIAS = 0.7  # chi2 with the links' inertias found, over that without, that is worth them by itself; geometric mean over joints
-CARRIED_OVER = 0.9  # squares of the torque left with inertias found, over those with inertias described, on parts left out, that are worth them
+# share of the discrepancy of torque and link encoders together, above which the torque is asked alone
+LEFT_BY_BOTH = 0.1
+# chi2 with the links' inertias found, over that without, that is worth them by itself; geometric mean over joints
+SETTLED_BY_INERTIAS = 0.7
+# squares of the torque left with inertias found, over those with inertias described, on parts left out, that are worth
+# them
+CARRIED_OVER = 0.9
 LEFT_TO_LINKS = 1e-3  # share of the discrepancy up to which errors of the laws of causes, not links, are what is left
 MAX_SECONDS = 600.0  # of search for causes
 SEED = 0
@@ -122,17 +126,23 @@ def diagnose_fully(
     late = find_link_delays(recorded, last, problem.sampling.sample_time)
     separating = separating_experiment(problem, result)
     belied = {r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)}
-    verdict = conclude(dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied)
+    verdict = conclude(
+        dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied
+    )
     if setup.ran_away:
         names = ", ".join(setup.ran_away)
-        notes.append(f"Not among the held-out data: {names}. Torques above {RUNAWAY:g} times those of the others say that the loop was lost.")
+        notes.append(
+            f"Not among the held-out data: {names}. Torques above {RUNAWAY:g} times those of the others say that the loop was lost."
+        )
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
     if rigid is not None and setup.held_out:
         notes.append("Held-out motions took part in the choice between these inertias and those of the description.")
     notes += [f"Not used: {line}." for line in not_fitted(given)]
     if gain is None and not setup.held_out:
-        notes.append("No gain is measured: nothing is held out, and of a single operating point nothing can be left out.")
+        notes.append(
+            "No gain is measured: nothing is held out, and of a single operating point nothing can be left out."
+        )
     verdict = replace(verdict, notes=(*verdict.notes, *notes))
     if doubts:
         verdict = withdrawn(verdict, doubts)
@@ -182,7 +192,9 @@ def held_out(
     problem, before, after = setup.problem, baseline.model, result.final.model
     if setup.held_out:
         errors, pairs = segment_errors(problem, setup.held_out, before, after)
-        gain = measure_gain(errors, units_of_torques(problem.structure.robot), affected, method, np.random.default_rng(SEED))
+        gain = measure_gain(
+            errors, units_of_torques(problem.structure.robot), affected, method, np.random.default_rng(SEED)
+        )
         return gain, tuple(g for g in setup.held_out if g.segments[0] in errors.segments), pairs
     gain = leave_one_out(setup, nominal, baseline, result, renewed, affected, workers)
     shown = problem.groups[:1]
@@ -206,8 +218,11 @@ def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
     )
 
 
-def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
-    """Causes of what the baseline leaves, and more of them where beside these the noise turns out to be far less than was guessed."""
+def sought(
+    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
+) -> tuple[Setup, Fit, Attribution]:
+    """Causes of what the baseline leaves, and more of them where beside these the noise turns out to be far less than
+    was guessed."""
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     try:
         other, first = under_noise_beside_causes(dataset, setup, result.final)
@@ -220,7 +235,8 @@ def sought(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, worke
 
 
 def unresolved(result: Attribution) -> bool:
-    """Whether so much is left without a cause, over noise and over the discrepancy, that links which are not as described may be why."""
+    """Whether so much is left without a cause, over noise and over the discrepancy, that links which are not as
+    described may be why."""
     much = result.final.chi2_per_dof > LEFT_ERROR and result.left_share > LEFT_TO_LINKS
     return result.detected and (much or result.unknown)
 
@@ -264,7 +280,8 @@ def explained(result: Attribution) -> bool:
 def with_inertias(
     setup: Setup, result: Attribution, max_causes: int, workers: Workers
 ) -> tuple[Setup, Attribution, RigidFit | None]:
-    """Causes sought anew with inertias of the links and offsets of the torque found from motions, where that explains far more.
+    """Causes sought anew with inertias of the links and offsets of the torque found from motions, where that explains
+    far more.
 
     The links of a real arm are not those of its description, torque records have offsets, and friction is
     judged wrongly beside both.
@@ -274,7 +291,9 @@ def with_inertias(
     try:
         rigid = fit_rigid(problem.structure, problem.nominal, problem.groups)
         problem = replace(problem, structure=rigid.structure, nominal=rigid.par)
-        offsets = tuple(Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names))
+        offsets = tuple(
+            Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names)
+        )
         baseline = fit_baseline(problem, workers.say, offsets)
     except NOT_COMPUTED:
         return setup, result, None
@@ -302,7 +321,8 @@ def worth_it(left: float, held_out: tuple[float, float]) -> bool:
     """Whether inertias found are kept, by what they leave over what is left without.
 
     Args:
-        left: of the motions that were fitted (``left_over``). Both sides have causes of their own, sought apart, which makes this rough.
+        left: of the motions that were fitted (``left_over``). Both sides have causes of their own, sought apart, which
+            makes this rough.
         held_out: interval of the same on held-out motions (``foretold``).
     """
     least, most = held_out
@@ -310,7 +330,8 @@ def worth_it(left: float, held_out: tuple[float, float]) -> bool:
 
 
 def foretold(setup: Setup, one: Fit, other: Fit) -> tuple[float, float]:
-    """Interval of what ``other`` leaves of held-out motions over what ``one`` leaves there (``ratio_interval``); (0, inf) where none are held out."""
+    """Interval of what ``other`` leaves of held-out motions over what ``one`` leaves there (``ratio_interval``); (0,
+    inf) where none are held out."""
     if not setup.held_out:
         return 0.0, np.inf
     errors, _ = segment_errors(setup.problem, setup.held_out, one.model, other.model)
@@ -318,7 +339,8 @@ def foretold(setup: Setup, one: Fit, other: Fit) -> tuple[float, float]:
 
 
 def left_over(one: Fit, other: Fit) -> float:
-    """What a fit leaves, over what another leaves: geometric mean over the joints, at each of them no less than noise."""
+    """What a fit leaves, over what another leaves: geometric mean over the joints, at each of them no less than
+    noise."""
     logs = [np.log(np.maximum(fit.costs / fit.counts, 1.0)) for fit in (one, other)]
     return float(np.exp(np.mean(logs[0] - logs[1])))
 

@@ -1,10 +1,10 @@
 """Noise that both factors of a normal equation hold.
 
-The measured position stands in the residual, ``e = U - Z Q``, and in its derivatives, ``-dZ Q``. Its noise is in both, and the
-mean of ``(dZ Q)^H C^-1 e`` is not zero where the model is right: least squares end elsewhere, however long the recording, and
-the further off the more lines hold noise alone (errors in variables; Soderstrom, Automatica 43, 2007). The scatter between
-periods tells what the noise of the means adds to the cost and to its slope, and both are taken off: what is left has its minimum
-where the model is right, whatever the weights.
+The measured position stands in the residual, ``e = U - Z Q``, and in its derivatives, ``-dZ Q``. Its noise is in both,
+and the mean of ``(dZ Q)^H C^-1 e`` is not zero where the model is right: least squares end elsewhere, however long the
+recording, and the further off the more lines hold noise alone (errors in variables; Soderstrom, Automatica 43, 2007).
+The scatter between periods tells what the noise of the means adds to the cost and to its slope, and both are taken off:
+what is left has its minimum where the model is right, whatever the weights.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from ident.model import Effect, Model
 from ident.stiction import as_held
 
 MOST = 0.9  # of the information on any direction of the coordinates, that may be taken off as noise
-CERTAINLY_MORE = 1.5  # what noise adds over all that there is, in some direction, that no scatter of its estimate explains
+# what noise adds over all that there is, in some direction, that no scatter of its estimate explains
+CERTAINLY_MORE = 1.5
 LEAST = 1e-12  # information on a coordinate that is none
 STEADY = 1e-10  # relative, of a normal matrix of which an inverse is taken
 
@@ -41,13 +42,18 @@ def scatter_costs(group: Group, pred: Prediction, whiten: np.ndarray, still: np.
 
 
 def scatter_slope(
-    group: Group, pred: Prediction, whiten: np.ndarray, baseline: Products, others: Iterator[tuple[int, np.ndarray]], count: int
+    group: Group,
+    pred: Prediction,
+    whiten: np.ndarray,
+    baseline: Products,
+    others: Iterator[tuple[int, np.ndarray]],
+    count: int,
 ) -> np.ndarray:
     """(p,) what it adds to ``J^H e`` of the normal equations, in the order of the coordinates.
 
     Args:
-        baseline: of ``baseline_products``, of the first coordinates; its signals do not matter. Gears beside laws count as linear
-            here, and with their mean slope in the cost: what that leaves is far below a deviation.
+        baseline: of ``baseline_products``, of the first coordinates; its signals do not matter. Gears beside laws count
+            as linear here, and with their mean slope in the cost: what that leaves is far below a deviation.
         others: coordinates and the derivatives (K, n, n) of the impedance by them.
         count: coordinates, p.
     """
@@ -73,15 +79,17 @@ def scatter_information(group: Group, pred: Prediction, whiten: np.ndarray, base
 
 
 def trusted_share(information: np.ndarray, by_noise: np.ndarray) -> float:
-    """Share of what noise adds that is taken off, 1 unless some direction of the coordinates would hold next to nothing then.
+    """Share of what noise adds that is taken off, 1 unless some direction of the coordinates would hold next to nothing
+    then.
 
-    0 where some coordinate is not felt, and where there would be more noise in a direction than there is of all: then the periods differ by more than noise, as those of a
-    motor that creeps do.
+    0 where some coordinate is not felt, and where there would be more noise in a direction than there is of all: then
+    the periods differ by more than noise, as those of a motor that creeps do.
 
     Args:
         information: normal matrix (p, p); by_noise: what noise adds to its first rows and columns.
     """
-    if np.any(np.diag(information)[: len(by_noise)] < LEAST):  # of a motor that is held nothing is left to take noise off
+    # of a motor that is held nothing is left to take noise off
+    if np.any(np.diag(information)[: len(by_noise)] < LEAST):
         return 0.0
     information, by_noise, _ = _scaled(information, by_noise)
     root = np.linalg.cholesky(information)
@@ -112,13 +120,17 @@ def _scaled(information: np.ndarray, by_noise: np.ndarray) -> tuple[np.ndarray, 
 
 
 def signals_per_position(pred: Prediction, count: int) -> np.ndarray:
-    """(count, m, n) signals of ``baseline_products`` per motor position: deflections, positions, elastic coordinates."""
+    """(count, m, n) signals of ``baseline_products`` per motor position: deflections, positions, elastic
+    coordinates."""
     plane, par, structure = pred.plane, pred.par, pred.structure
     links = (plane.A_inv[:count][:, :, structure.driven] * plane.C[:count, None]) @ par.coupling
     deflections = par.coupling - links[:, structure.driven]
     n = par.coupling.shape[1]
     elastic = links[:, np.asarray(structure.elastic, int)]
-    return np.concatenate([deflections, np.broadcast_to(np.eye(n), (count, n, n)), elastic], axis=1) * pred.filters[1][:count, None]
+    return (
+        np.concatenate([deflections, np.broadcast_to(np.eye(n), (count, n, n)), elastic], axis=1)
+        * pred.filters[1][:count, None]
+    )
 
 
 def _whitened_gains(pred: Prediction, whiten: np.ndarray, baseline: Products) -> np.ndarray:

@@ -231,7 +231,9 @@ class _Criterion:
     def linearised(self, par: Parameters) -> Linearisation:
         """Matrices at the equilibrium of every operating point, one for each line of each."""
         lins = [linearise(self.structure, equilibrium(self.structure, par, q)) for q in self.frf.q0]
-        M, Kg = (np.repeat([getattr(lin, name) for lin in lins], len(self.frf.frequency), axis=0) for name in ("M", "Kg"))
+        M, Kg = (
+            np.repeat([getattr(lin, name) for lin in lins], len(self.frf.frequency), axis=0) for name in ("M", "Kg")
+        )
         return Linearisation(np.empty(0), M, Kg, np.empty(0))
 
     def residual(self, par: Parameters, lin: Linearisation, part: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -258,9 +260,7 @@ class _Criterion:
         """The lines in portions that stay in the cache."""
         return [slice(k, k + PORTION) for k in range(0, len(self.g), PORTION)]
 
-    def normal(
-        self, par: Parameters, lin: Linearisation, fitted: np.ndarray
-    ) -> tuple[float, np.ndarray, np.ndarray]:
+    def normal(self, par: Parameters, lin: Linearisation, fitted: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Cost, half its gradient and the Gauss-Newton matrix for the fitted of all coordinates."""
         cost, g, H = 0.0, 0.0, 0.0
         for part in self.parts:

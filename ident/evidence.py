@@ -16,7 +16,8 @@ from ident.torque_fit import Fit, inverse
 ABSENT = 3.0  # standard deviations from its null within which a parameter counts as absent
 ABSENT_LEVEL = 2.7e-3  # the same of several together, as a probability
 TEMPER = 3.0  # evidence differences are divided by this: neighbouring lines share their errors
-TEMPER_OF_NOISE = 1.5  # the same where the model without any of them leaves noise alone, which is known by the scatter of a few periods
+# the same where the model without any of them leaves noise alone, which is known by the scatter of a few periods
+TEMPER_OF_NOISE = 1.5
 MODEL_ERROR_SHARE = 0.3  # share of the model error that a wrong hypothesis may absorb by chance
 STEADY = 1e-9  # relative, of an information matrix of which an inverse is taken
 LAW_ERROR = 0.01  # share of what a cause explains that errors of its law leave
@@ -43,8 +44,8 @@ def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
     Of several causes at different joints each explains a part of the whole and most of its own joint.
 
     Args:
-        noise: of what is compared, in units of the weights: next to nothing where these bear with large errors, and at most what
-            its estimate may be short of where no more is left.
+        noise: of what is compared, in units of the weights: next to nothing where these bear with large errors, and at
+            most what its estimate may be short of where no more is left.
     """
     falls = before.costs - after.costs
     joint = int(np.argmax(falls))
@@ -56,7 +57,8 @@ def explained(before: Fit, after: Fit, noise: float = 1.0) -> float:
 def rivals_of_best(
     before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]
 ) -> tuple[list[tuple[Hypothesis, Fit]], np.ndarray]:
-    """Candidates that explain some of what the best one does, and the excess over noise by joint that counts as an error of theirs.
+    """Candidates that explain some of what the best one does, and the excess over noise by joint that counts as an
+    error of theirs.
 
     A real arm has causes at every joint: one that explains another joint is no alternative, and what is left
     there is no error of this one. A change of the chain is seen at every joint.
@@ -76,7 +78,8 @@ def rivals_of_best(
 def errors_by_joint(left: np.ndarray, counts: np.ndarray, fall: float) -> np.ndarray:
     """(n,) ``model_error`` of each joint, and at all of them a share of what is clearly left anywhere.
 
-    What another cause leaves at its own joint blurs what candidates do there, and next to nothing of what they do elsewhere.
+    What another cause leaves at its own joint blurs what candidates do there, and next to nothing of what they do
+    elsewhere.
 
     Args:
         left: (n,) costs that the best candidate leaves, of ``counts`` data.
@@ -89,8 +92,8 @@ def errors_by_joint(left: np.ndarray, counts: np.ndarray, fall: float) -> np.nda
 def model_error(left: float, count: float, fall: float) -> float:
     """Excess of a cost over noise that counts as an error of the law that leaves it.
 
-    What lies within the error of the estimate of the noise counts as far as it is a ``LAW_ERROR`` of what the law explains;
-    all of it where that is not known.
+    What lies within the error of the estimate of the noise counts as far as it is a ``LAW_ERROR`` of what the law
+    explains; all of it where that is not known.
 
     Args:
         left: cost that the best candidate leaves, of ``count`` data.
@@ -101,14 +104,17 @@ def model_error(left: float, count: float, fall: float) -> float:
     return above + (min(within, LAW_ERROR * fall) if fall > 0.0 else within)
 
 
-def weigh(candidates: Sequence[Candidate], excess: np.ndarray, falls: np.ndarray, temper: float = TEMPER) -> list[Candidate]:
+def weigh(
+    candidates: Sequence[Candidate], excess: np.ndarray, falls: np.ndarray, temper: float = TEMPER
+) -> list[Candidate]:
     """Probabilities of refitted hypotheses, best first.
 
     Under pure noise the evidence is half the difference of the costs. What the best model leaves
     above the noise is model error, and a wrong hypothesis may absorb part of that by chance: a
     difference at a joint counts only against ``temper + MODEL_ERROR_SHARE x excess`` there. Parameters count by how far
-    the data narrow them down (``occam``), at the joints where the effect is seen. What explains far less than the best of
-    them may be another cause, at a joint that little is left at: all that it leaves counts as at the joints of the best.
+    the data narrow them down (``occam``), at the joints where the effect is seen. What explains far less than the best
+    of them may be another cause, at a joint that little is left at: all that it leaves counts as at the joints of the
+    best.
 
     Args:
         excess: (n,) cost beyond noise by joint that the best of them leaves (``errors_by_joint``).
@@ -153,7 +159,9 @@ def occam(candidate: Candidate, temper: float) -> float:
     if np.any(absent):
         # Those that the data only know together can each be at their nulls, and not all of them.
         off = (x - nulls)[absent]
-        if off @ inverse(covariance[np.ix_(absent, absent)], STEADY) @ off > scipy.stats.chi2.isf(ABSENT_LEVEL, len(off)):
+        if off @ inverse(covariance[np.ix_(absent, absent)], STEADY) @ off > scipy.stats.chi2.isf(
+            ABSENT_LEVEL, len(off)
+        ):
             absent[:] = False
     keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
     count = int(np.sum(~absent))

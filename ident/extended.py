@@ -65,7 +65,8 @@ class Prediction:
 
     @cached_property
     def filters(self) -> tuple[np.ndarray, np.ndarray]:
-        """What linear drives record per torque that they deliver, and the true position per measured one; (L, n) each."""
+        """What linear drives record per torque that they deliver, and the true position per measured one; (L, n)
+        each."""
         return linear_filters(self.model, self.plane.s)
 
 
@@ -84,7 +85,8 @@ def linear_filters(model: Model, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def passed_by_filters(model: Model, s: np.ndarray) -> np.ndarray:
-    """Measured position of a bare motor per recorded torque, over that with neither drives nor sensors that filter; (F, n)."""
+    """Measured position of a bare motor per recorded torque, over that with neither drives nor sensors that filter; (F,
+    n)."""
     recorded, true = linear_filters(model, s)
     return 1.0 / (recorded * true)
 
@@ -111,7 +113,8 @@ def predict(
     return predict_at(model, structure, par, plane, group, sampling, W=W, steps=steps, torques=torques)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of torques that run away: those who ask see that the result is not finite
+# of torques that run away: those who ask see that the result is not finite
+@np.errstate(over="ignore", invalid="ignore")
 def predict_at(
     model: Model,
     structure: Structure,
@@ -142,13 +145,20 @@ def predict_at(
     inner = by_channel.get("link", []) + by_channel.get("spring", [])
     motor = by_channel.get("motor", [])
     along = joints_along_record(model, group)
-    inner.sort(key=lambda e: e.hypothesis.joint in along and is_along_record(e.hypothesis))  # after what else is at the gear
+    # after what else is at the gear
+    inner.sort(key=lambda e: e.hypothesis.joint in along and is_along_record(e.hypothesis))
     drives = by_channel.get("drive", [])
     given = delivered(drives, group, plane) if any(is_dry(e) for e in motor) else None
-    react = partial(inner_torques, structure, par, plane, group, effects=inner, motors=motor, given=given, along=along) if inner else None
+    react = (
+        partial(inner_torques, structure, par, plane, group, effects=inner, motors=motor, given=given, along=along)
+        if inner
+        else None
+    )
     passes = 1 if len(inner) == 1 and has_loop(inner[0]) else REACTION_STEPS
     start = torques if inner else Torques()
-    solution = solve(structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps)
+    solution = solve(
+        structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps
+    )
     if motor:
         motion = Motion(group, solution, par, delivered=given, told=along)
         at_motors = plane.record[:, None] * motor_torques(par, motion, motor)

@@ -1,12 +1,13 @@
 """Causes that raise the noise as a whole by less than its estimate errs.
 
-The sum of squares over all lines of all joints shows a cause only where it raises that sum by more than the error of the
-estimate of the noise. The response of one hypothesis is a few numbers, and known to far less: nothing but noise explains
-about 20 of the cost in the best of all hypotheses, on any arm, and a tenth more noise at each of many thousand lines
-no more than a tenth more of that (score test, Rao 1948; theory.md 9.3).
+The sum of squares over all lines of all joints shows a cause only where it raises that sum by more than the error of
+the estimate of the noise. The response of one hypothesis is a few numbers, and known to far less: nothing but noise
+explains about 20 of the cost in the best of all hypotheses, on any arm, and a tenth more noise at each of many thousand
+lines no more than a tenth more of that (score test, Rao 1948; theory.md 9.3).
 
-Where the scatter between periods does not say how the noise is spread over the lines, what noise alone explains is told by
-what is left itself with its phases drawn anew, all joints of a line together: of the same spectrum and correlation, and no response.
+Where the scatter between periods does not say how the noise is spread over the lines, what noise alone explains is told
+by what is left itself with its phases drawn anew, all joints of a line together: of the same spectrum and correlation,
+and no response.
 """
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ from ident.screening import Score, screen
 from ident.torque_fit import Fit
 
 SEEN = 32.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
-ROUGH = 10.0  # factor on that beside a law along the record, whose noise is known by a few draws, or one under which single
+# factor on that beside a law along the record, whose noise is known by a few draws, or one under which single
+ROUGH = 10.0
 # records may be in another steady motion than the model
-LINEAR = 0.3  # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
+# of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
+LINEAR = 0.3
 PHASES = 4  # draws of phases
 BY_PHASES = 2.5  # factor on what the best of all hypotheses explains of those, from which a faint cause is sought
-SHADOW = 1e-3  # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
+# share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
+SHADOW = 1e-3
 
 
 def hidden(
@@ -45,22 +49,26 @@ def hidden(
         told: as of ``faint_scores``.
 
     Returns:
-        The hypotheses, and about the probability that the best of all explains so much of noise alone (Bonferroni, a trial each).
+        The hypotheses, and about the probability that the best of all explains so much of noise alone (Bonferroni, a
+        trial each).
     """
     scores = faint_scores(problem, current, hypotheses, told)
     clear = seen(scores, current)
-    if clear is None or (not scatter_is_seen(problem) and clear.gain < BY_PHASES * by_phases(problem, current, hypotheses)):
+    if clear is None or (
+        not scatter_is_seen(problem) and clear.gain < BY_PHASES * by_phases(problem, current, hypotheses)
+    ):
         return (), 1.0
     chance = min(1.0, len(scores) * scipy.stats.chi2.sf(clear.gain, clear.dof))
     return tuple(s.hypothesis for s in scores if s.gain >= LINEAR * clear.gain), float(chance)
 
 
 def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray) -> list[Score]:
-    """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start from.
+    """What hypotheses explain beyond what laws already found may leave, best first; of those that have a place to start
+    from.
 
-    None of motions, nor beside link encoders, of which the weights follow what the model leaves. None where periods drift, at
-    that joint or of the whole chain: a few numbers explain much of such noise. None at the joint of a law along the record,
-    which turns noise into a signal of its own there.
+    None of motions, nor beside link encoders, of which the weights follow what the model leaves. None where periods
+    drift, at that joint or of the whole chain: a few numbers explain much of such noise. None at the joint of a law
+    along the record, which turns noise into a signal of its own there.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.
@@ -83,10 +91,14 @@ def scatter_is_seen(problem: Problem) -> bool:
 
 
 def by_phases(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> float:
-    """What the best of all hypotheses explains of what a model leaves, with phases drawn anew: the most in a few draws."""
+    """What the best of all hypotheses explains of what a model leaves, with phases drawn anew: the most in a few
+    draws."""
     preds = predictions(problem, current.model, current.remainders)
     rng = np.random.default_rng(PHASES)
-    draws = (replace(problem, groups=tuple(redrawn(g, p, rng) for g, p in zip(problem.groups, preds, strict=True))) for _ in range(PHASES))
+    draws = (
+        replace(problem, groups=tuple(redrawn(g, p, rng) for g, p in zip(problem.groups, preds, strict=True)))
+        for _ in range(PHASES)
+    )
     return max(screen(draw, current, preds, hypotheses)[0].gain for draw in draws)
 
 
@@ -98,10 +110,11 @@ def redrawn(group: Group, prediction: Prediction, rng: np.random.Generator) -> G
 
 
 def left_by_laws(current: Fit, told: np.ndarray) -> np.ndarray:
-    """Cost by joint (n,) that errors of the laws of causes already found may leave, in proportion to what causes explain there.
+    """Cost by joint (n,) that errors of the laws of causes already found may leave, in proportion to what causes
+    explain there.
 
-    Such errors show at the joint of their cause first. Elsewhere they leave no larger share than there, as far as the noise
-    there is known; a change of the chain has no such joint.
+    Such errors show at the joint of their cause first. Elsewhere they leave no larger share than there, as far as the
+    noise there is known; a change of the chain has no such joint.
 
     Args:
         told: (n,) fall of the cost by joint that causes have brought.
@@ -118,7 +131,8 @@ def left_by_laws(current: Fit, told: np.ndarray) -> np.ndarray:
 
 
 def seen(scores: Sequence[Score], current: Fit) -> Score | None:
-    """The clearest score, if noise does not come near it by chance, nor noise that was estimated too small at its joint."""
+    """The clearest score, if noise does not come near it by chance, nor noise that was estimated too small at its
+    joint."""
     whole = max(1.0, current.chi2_per_dof)
     by_joint = np.maximum(current.costs / np.maximum(current.counts, 1.0), whole)
     least = SEEN * (ROUGH if has_rough_law(current.model) else 1.0)

@@ -85,17 +85,29 @@ def extended_kalman(structure: Structure, runs: Runs) -> Predictor:
             if runs.spread is not None:
                 P = P + np.diag(np.repeat(runs.spread[r] ** 2, len(P) // 2))
             _extended(
-                chain, s.x0, s.u0, s.A, s.B, s.hold, s.rise, s.springs, s.flat, Q, noise.measurement**2,
-                P, runs.u[r], runs.y[r], e[r], S[r],
+                chain,
+                s.x0,
+                s.u0,
+                s.A,
+                s.B,
+                s.hold,
+                s.rise,
+                s.springs,
+                s.flat,
+                Q,
+                noise.measurement**2,
+                P,
+                runs.u[r],
+                runs.y[r],
+                e[r],
+                S[r],
             )
         return gaussian(e[:, runs.skip :], S[:, runs.skip :])
 
     return predict
 
 
-def particle_filter(
-    structure: Structure, runs: Runs, *, particles: int = 200, seed: int = 0
-) -> Predictor:
+def particle_filter(structure: Structure, runs: Runs, *, particles: int = 200, seed: int = 0) -> Predictor:
     """Predictor by a bootstrap filter: mean and covariance of the predicted particles, and their likelihood.
 
     The random numbers are the same in every call: what is compared is parameters, not draws. Particles are drawn
@@ -103,12 +115,12 @@ def particle_filter(
     is to be taken over steps that change it by more than that (``fit_prediction``, ``guide``). Slopes of the particles
     themselves are no way out: they are those of an arm without feedback, which weights would have to undo.
 
-    How far that reaches: on two joints of the ur10 with 2 x 2000 samples that count, the log-likelihood of 100 particles
-    at the true parameters is that of the extended filter less 80, +-33 over seeds (200: less 51, +-31), and between springs
-    0.1 % apart its change scatters by 35 although the random numbers are the same, for they meet other ancestors; one
-    standard deviation of a spring is worth 0.5. Drawing particles with the next sample in sight would not mend that: what
-    the torque noise of one sample moves is 1e-5 of the variance of the encoder. What would, a Kalman filter in each
-    particle, is the extended filter again on an arm as nearly linear as this.
+    How far that reaches: on two joints of the ur10 with 2 x 2000 samples that count, the log-likelihood of 100
+    particles at the true parameters is that of the extended filter less 80, +-33 over seeds (200: less 51, +-31), and
+    between springs 0.1 % apart its change scatters by 35 although the random numbers are the same, for they meet other
+    ancestors; one standard deviation of a spring is worth 0.5. Drawing particles with the next sample in sight would
+    not mend that: what the torque noise of one sample moves is 1e-5 of the variance of the encoder. What would, a
+    Kalman filter in each particle, is the extended filter again on an arm as nearly linear as this.
 
     Raises:
         DataError: for runs that begin in motion: next to none of the particles would be near.
@@ -127,8 +139,25 @@ def particle_filter(
             spread = vector * np.sqrt(np.maximum(value, 0.0))
             X = s.x0 + rng.standard_normal((particles, len(s.x0))) @ spread.T
             _bootstrap(
-                chain, s.x0, s.u0, s.A, s.B, s.hold, s.rise, s.springs, s.flat, noise.process, noise.measurement,
-                X, rng.standard_normal((T, particles, n)), rng.random(T), runs.u[r], runs.y[r], e[r], S[r], gain[r],
+                chain,
+                s.x0,
+                s.u0,
+                s.A,
+                s.B,
+                s.hold,
+                s.rise,
+                s.springs,
+                s.flat,
+                noise.process,
+                noise.measurement,
+                X,
+                rng.standard_normal((T, particles, n)),
+                rng.random(T),
+                runs.u[r],
+                runs.y[r],
+                e[r],
+                S[r],
+                gain[r],
             )
         return Prediction(e[:, runs.skip :], S[:, runs.skip :], float(gain[:, runs.skip :].sum()))
 

@@ -91,7 +91,9 @@ def estimate_frf(
         realizations=min(b.U.shape[0] for b in blocks),
         periods=min(b.U.shape[1] for b in blocks),
         estimator=kind,
-        not_used=tuple(s.name for members in points.values() for x in experiment_sets(members, n) if len(x) < n for s in x.values()),
+        not_used=tuple(
+            s.name for members in points.values() for x in experiment_sets(members, n) if len(x) < n for s in x.values()
+        ),
     )
 
 
@@ -133,7 +135,9 @@ def _blocks(members: list[Segment], lines: np.ndarray, frequency: np.ndarray, n:
         if with_r:
             R.append(np.stack([spectra(s, "r").mean(axis=0) for s in chosen], axis=-1))
     if np.any(np.linalg.cond(np.mean(U, axis=1)) > 1e8):
-        raise DataError("tau", f"operating point {name}", "experiments that are not independent", f"{n} independent ones")
+        raise DataError(
+            "tau", f"operating point {name}", "experiments that are not independent", f"{n} independent ones"
+        )
     reference = np.stack(R) if with_r else None
     if reference is not None and np.any(np.linalg.cond(reference) > 1e8):
         reference = None

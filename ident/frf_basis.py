@@ -1,4 +1,5 @@
-"""What all estimators of FRFs share: their result, the segments and lines that it comes from, and covariances over lines."""
+"""What all estimators of FRFs share: their result, the segments and lines that it comes from, and covariances over
+lines."""
 
 from __future__ import annotations
 
@@ -62,7 +63,9 @@ def choose_segments(
     segments = _periodic(dataset, role)
     unsaid = [s.name for s in dataset.select(role=role, kind="multisine") if not len(s.excited_lines)]
     if not segments and unsaid:
-        raise DataError("excited_lines", f"{dataset.name}, segment {unsaid[0]}", "none", "the lines of the period that are excited")
+        raise DataError(
+            "excited_lines", f"{dataset.name}, segment {unsaid[0]}", "none", "the lines of the period that are excited"
+        )
     if not segments:
         raise DataError("multisine segments", dataset.name, f"none of role {role}", "at least n per operating point")
     level = max(s.amplitude for s in segments) if amplitude is None else amplitude

@@ -34,7 +34,10 @@ def write_frf(dataset: Dataset, out: str | Path, estimator: str = "auto") -> dic
         "median_relative_std": float(np.median(frf.total_std / magnitude)),
         "distortion_N_m": {
             kind: {
-                joint: {f"level {a:g}": float(np.nanmean(getattr(distortion, kind)[:, i, j])) for i, a in enumerate(distortion.levels)}
+                joint: {
+                    f"level {a:g}": float(np.nanmean(getattr(distortion, kind)[:, i, j]))
+                    for i, a in enumerate(distortion.levels)
+                }
                 for j, joint in enumerate(dataset.joints)
             }
             for kind in ("excited", "noise", "even", "odd")

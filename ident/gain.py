@@ -23,7 +23,8 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean squared torque error of each segment, each stretch of a motion or each line, and joint, N2 m2; each (rows, n).
+    """Mean squared torque error of each segment, each stretch of a motion or each line, and joint, N2 m2; each (rows,
+    n).
 
     ``segments``: of the rows, a motion as often as it has stretches, a single periodic record as often as it has lines.
     """
@@ -41,9 +42,10 @@ def segment_errors(
 
     Along a motion too large for a model its links cannot be solved; such a group is left out of the
     errors of both models, and of the pairs of predictions. Where there are motions alone, each is cut into
-    ``STRETCHES``: one of them says by its parts how much chance there is in what is gained. A periodic record that stands
-    alone says it by its lines: under random phases errors at different lines are independent (Pintelon and Schoukens
-    2012, ch. 3). Its periods do not: the error of the model is the same in each, and they would show noise alone.
+    ``STRETCHES``: one of them says by its parts how much chance there is in what is gained. A periodic record that
+    stands alone says it by its lines: under random phases errors at different lines are independent (Pintelon and
+    Schoukens 2012, ch. 3). Its periods do not: the error of the model is the same in each, and they would show noise
+    alone.
 
     Args:
         alone: whether the groups are all that is held out.
@@ -66,7 +68,9 @@ def segment_errors(
         noise = share * np.einsum("kii->ki", S).real
         if by_line:
             names += group.segments * group.n_compared
-            for store, lines in zip(out, (*(np.abs(group.observe(group.U - p.U)[0]) ** 2 for p in (a, b)), noise), strict=True):
+            for store, lines in zip(
+                out, (*(np.abs(group.observe(group.U - p.U)[0]) ** 2 for p in (a, b)), noise), strict=True
+            ):
                 store.append(line_squares(lines))
             continue
         names += [name for name in group.segments for _ in range(parts)]
@@ -84,12 +88,14 @@ def mean_squares(lines: np.ndarray) -> np.ndarray:
 
 
 def line_squares(lines: np.ndarray) -> np.ndarray:
-    """Shares of lines (K, n) in a mean square, from their squared moduli (K, n), line 0 first; their mean over lines is that square."""
+    """Shares of lines (K, n) in a mean square, from their squared moduli (K, n), line 0 first; their mean over lines is
+    that square."""
     return len(lines) * np.concatenate([lines[:1], 2.0 * lines[1:]])
 
 
 def stretch_squares(group: Group, lines: np.ndarray, parts: int) -> np.ndarray:
-    """Mean squares (parts, n) of a windowed motion from its lines (1, K, n), by stretches of time; their mean is that of the whole."""
+    """Mean squares (parts, n) of a windowed motion from its lines (1, K, n), by stretches of time; their mean is that
+    of the whole."""
     full = np.zeros((1, len(group.omega), lines.shape[2]), complex)
     full[:, : lines.shape[1]] = lines
     squares = group.to_time(full)[0] ** 2
@@ -109,10 +115,10 @@ def measure_gain(
 ) -> Gain | None:
     """Rms errors, share of the gap to the noise floor that is closed, and its 95 % interval.
 
-    The interval is a percentile bootstrap over segments, over stretches of motions, or over the lines of a single periodic
-    record: what other phases of the same excitation would show in that posture, and nothing of other postures. It is as wide
-    as errors of one size at all lines ask for, and wider than needed where few of them hold most. None where no segment could be
-    predicted.
+    The interval is a percentile bootstrap over segments, over stretches of motions, or over the lines of a single
+    periodic record: what other phases of the same excitation would show in that posture, and nothing of other postures.
+    It is as wide as errors of one size at all lines ask for, and wider than needed where few of them hold most. None
+    where no segment could be predicted.
 
     Args:
         joints: unit of the torque of each.
@@ -149,7 +155,8 @@ def measure_gain(
 
 
 def ratio_interval(errors: Errors, rng: np.random.Generator) -> tuple[float, float]:
-    """95 % interval of the squares left after, over those left before, at each joint no less than noise; geometric mean over the joints.
+    """95 % interval of the squares left after, over those left before, at each joint no less than noise; geometric mean
+    over the joints.
 
     A percentile bootstrap over the rows of ``errors``; (0, inf) where there are too few for one.
     """

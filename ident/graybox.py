@@ -8,7 +8,8 @@ elastic hinge that no motor turns),
     tau_s = K (T q_m - S^T q_a) + D (T q_m' - S^T q_a'),    q_d = S^T q_a
 
 (Moberg, Oehr and Gunnarsson 2014; Spong 1987 for N = n). ``T`` is the identity unless the gears
-couple joints, and ``b`` is zero unless the links have friction of their own. All drive figures are referred to the link side of the gear.
+couple joints, and ``b`` is zero unless the links have friction of their own. All drive figures are referred to the link
+side of the gear.
 """
 
 from __future__ import annotations
@@ -167,7 +168,9 @@ def damping_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
     return out
 
 
-IMAGES = 8  # of a held torque on either side, that drives and sensors may change; each of the next has a seven-hundredth of the first at most
+# of a held torque on either side, that drives and sensors may change; each of the next has a seven-hundredth of the
+# first at most
+IMAGES = 8
 
 
 def hold_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarray:
@@ -192,8 +195,9 @@ def alias_response(
     baseband part. The error left is of the order of (resonance / sample rate)^2 of this term.
 
     Args:
-        passed: what drives and sensors let pass at complex frequencies (F,), rad/s; (F, n). The result is (F, n) then. A current loop
-            that takes a millisecond lets hardly any of the images pass, where it takes little from the band.
+        passed: what drives and sensors let pass at complex frequencies (F,), rad/s; (F, n). The result is (F, n) then.
+            A current loop that takes a millisecond lets hardly any of the images pass, where it takes little from the
+            band.
     """
     if hold == "none":
         return np.zeros(len(omega), complex)

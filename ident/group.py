@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 import scipy.fft
 
-SURE, CREEPING = 3.0, 0.02  # standard deviations of a velocity, and share of its rms, below which a motor may as well rest
+# standard deviations of a velocity, and share of its rms, below which a motor may as well rest
+SURE, CREEPING = 3.0, 0.02
 NOISE_LINES = 10  # lines on either side over which the noise of the position is averaged
 SIGNAL_LEVEL = 2.0  # power over noise below which a line of the position counts as noise
 FAST_LEVEL = 1.5  # the same of the mean power of lines near by: that of noise alone differs by less from its own mean
@@ -40,14 +41,14 @@ class Group:
         period_time: s.
         periods: (S,) number of periods averaged.
         rest: (S, n_time, n) where motors stand still, or turn.
-        Q_fast: (S, F, n) mean spectra of the position beyond lines 0..L-1, as far as they are signal and the time grid reaches;
-            None of a motion.
-        noise_spacing, U_noise, Q_noise: (S, J, n) spectra of noise alone, every so many lines of the period, where a single
-            period has no scatter (``ends_of_transients``); or None.
-        known_noise: (n,) variances of a line of torque and position by white noise, N2 m2 and rad2, of a single period of which they are
-            measured; or None.
-        rounding: (K, n) variance of a line of the mean position by the steps of its encoder, rad2, which repeats with the motion and
-            does not average out over periods; or None.
+        Q_fast: (S, F, n) mean spectra of the position beyond lines 0..L-1, as far as they are signal and the time grid
+            reaches; None of a motion.
+        noise_spacing, U_noise, Q_noise: (S, J, n) spectra of noise alone, every so many lines of the period, where a
+            single period has no scatter (``ends_of_transients``); or None.
+        known_noise: (n,) variances of a line of torque and position by white noise, N2 m2 and rad2, of a single period
+            of which they are measured; or None.
+        rounding: (K, n) variance of a line of the mean position by the steps of its encoder, rad2, which repeats with
+            the motion and does not average out over periods; or None.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -84,7 +85,8 @@ class Group:
 
     @property
     def shows_noise(self) -> bool:
-        """Whether its noise is measured: by the scatter between periods, or by the end of the transient before a single one."""
+        """Whether its noise is measured: by the scatter between periods, or by the end of the transient before a single
+        one."""
         return self.window is None and (self.U_periods.shape[1] > 1 or self.U_noise is not None)
 
     @property
@@ -94,18 +96,24 @@ class Group:
 
     @cached_property
     def scatter(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Covariances (K, n, n) of torque, of torque and position, and of position, of noise of the means; sums over records.
+        """Covariances (K, n, n) of torque, of torque and position, and of position, of noise of the means; sums over
+        records.
 
-        By the scatter between periods, or noise that is known of a single one; None where neither is, and beside link encoders.
+        By the scatter between periods, or noise that is known of a single one; None where neither is, and beside link
+        encoders.
         """
         periods = self.U_periods.shape[1]
         if self.links or (periods < 2 and self.known_noise is None):
             return None
         if periods < 2:
-            torque, position = (len(self.U) * np.tile(np.diag(x).astype(complex), (self.n_compared, 1, 1)) for x in self.known_noise)
+            torque, position = (
+                len(self.U) * np.tile(np.diag(x).astype(complex), (self.n_compared, 1, 1)) for x in self.known_noise
+            )
             return torque, np.zeros_like(torque), position
         U, Q = (
-            (x - x.mean(axis=1, keepdims=True))[:, :, : self.n_compared].transpose(2, 3, 0, 1).reshape(self.n_compared, x.shape[-1], -1)
+            (x - x.mean(axis=1, keepdims=True))[:, :, : self.n_compared]
+            .transpose(2, 3, 0, 1)
+            .reshape(self.n_compared, x.shape[-1], -1)
             for x in (self.U_periods, self.Q_periods)
         )
         scale = periods * (periods - 1)
@@ -132,8 +140,8 @@ class Group:
     def shown_error(self) -> np.ndarray:
         """(S, L, n) power by which that motion is off, rad2: the noise it holds, and the signal it has lost.
 
-        By Stein's unbiased estimate (Stein 1981), in the mean over lines near by, which takes away most of its own scatter; what
-        is below zero then counts as none.
+        By Stein's unbiased estimate (Stein 1981), in the mean over lines near by, which takes away most of its own
+        scatter; what is below zero then counts as none.
         """
         noise, power = self.position_noise, np.abs(self.Q) ** 2
         least = SIGNAL_LEVEL * noise
@@ -165,7 +173,8 @@ class Group:
 
     @cached_property
     def fast_velocity(self) -> np.ndarray | None:
-        """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps; None of a motion."""
+        """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps;
+        None of a motion."""
         if self.Q_fast is None:
             return None
         L, count = len(self.omega), self.Q_fast.shape[1]
@@ -190,7 +199,22 @@ class Group:
 
     def pick(self, rows: np.ndarray) -> Group:
         """The group with some of its segments."""
-        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "excited", "amplitude", "start", "temperature", "periods", "rest", "Q_fast", "U_noise", "Q_noise")
+        names = (
+            "U",
+            "Q",
+            "U_periods",
+            "Q_periods",
+            "Q_link",
+            "excited",
+            "amplitude",
+            "start",
+            "temperature",
+            "periods",
+            "rest",
+            "Q_fast",
+            "U_noise",
+            "Q_noise",
+        )
         parts = {name: getattr(self, name) for name in names}
         kept = {name: None if x is None else x[rows] for name, x in parts.items()}
         return replace(self, segments=tuple(self.segments[i] for i in rows), **kept)
@@ -200,7 +224,14 @@ class Group:
         names = ("U", "Q", "U_periods", "Q_periods", "Q_link")
         parts = {name: getattr(self, name) for name in names}
         cut = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
-        return replace(self, omega=self.omega[: self.n_slow], excited=self.excited[:, : self.n_slow], n_slow=None, Q_fast=None, **cut)
+        return replace(
+            self,
+            omega=self.omega[: self.n_slow],
+            excited=self.excited[:, : self.n_slow],
+            n_slow=None,
+            Q_fast=None,
+            **cut,
+        )
 
     @property
     def recorded_share(self) -> float:
@@ -266,7 +297,8 @@ def line_noise(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
 
 
 def signal_power(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """Mean (S, L, n) over periods (S, P, L, n) of lines that hold little but noise, each by the share of signal near by (Wiener 1949)."""
+    """Mean (S, L, n) over periods (S, P, L, n) of lines that hold little but noise, each by the share of signal near by
+    (Wiener 1949)."""
     mean = X_periods.mean(axis=1)
     if not mean.shape[1]:
         return mean

@@ -30,4 +30,6 @@ def not_fitted(dataset: Dataset) -> list[str]:
     if not names or not dataset.select(role="identification", kind="multisine"):
         return []
     those = names[0] if len(names) == 1 else f"{len(names)} motions, {names[0]} first"
-    return [f"{those} of role identification: nothing is fitted to motions beside multisines; as validation they would test the model"]
+    return [
+        f"{those} of role identification: nothing is fitted to motions beside multisines; as validation they would test the model"
+    ]

@@ -74,14 +74,19 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
         nominal,
         tau_std,
         q_std,
-        # Of a single axis whose torque is held from sample to sample a common offset is a delay of its drive or its sensor.
+        # Of a single axis whose torque is held from sample to sample a common offset is a delay of its drive or its
+        # sensor.
         free_timing=robot.n > 1 or dataset.input_hold == "none",
     )
     if data_count(problem) <= len(nominal.to_log()):
         found = f"{data_count(problem)} numbers to compare"
-        raise DataError("segments", dataset.name, found, f"more than the {len(nominal.to_log())} parameters: longer records")
+        raise DataError(
+            "segments", dataset.name, found, f"more than the {len(nominal.to_log())} parameters: longer records"
+        )
     if not moves(dataset, q_std):
-        raise DataError("positions", dataset.name, "no joint that moves beyond its noise", "motion that the drives bring about")
+        raise DataError(
+            "positions", dataset.name, "no joint that moves beyond its noise", "motion that the drives bring about"
+        )
     return Setup(problem, held_out, steps, ran_away)
 
 
@@ -93,8 +98,8 @@ def declared_position_noise(dataset: Dataset) -> np.ndarray:
 def runaways(dataset: Dataset) -> tuple[str, ...]:
     """Names of held-out segments in which the loop was lost: their torque is beyond all that a model was fitted to.
 
-    A drive at its limit asks for ever more; what it asks for then cannot be told from how the arm moved, and would outweigh
-    all else that is held out.
+    A drive at its limit asks for ever more; what it asks for then cannot be told from how the arm moved, and would
+    outweigh all else that is held out.
     """
     known = max((np.abs(s.tau).max() for s in dataset.select(role="identification")), default=np.inf)
     return tuple(s.name for s in dataset.select(role="validation") if np.abs(s.tau).max() > RUNAWAY * known)
@@ -124,8 +129,8 @@ def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) 
 def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Sample noise of position and torque: as given, else from fourth differences of the identification segments.
 
-    A torque that is not held from sample to sample may be made by a faster loop, of which the record holds single samples: what circulates
-    there folds into all lines, and is noise beside that which is given.
+    A torque that is not held from sample to sample may be made by a faster loop, of which the record holds single
+    samples: what circulates there folds into all lines, and is noise beside that which is given.
     """
     return _noise_of(dataset, "q"), _noise_of(dataset, "tau")
 
@@ -145,7 +150,8 @@ def given_noise(dataset: Dataset, channel: str) -> np.ndarray | None:
 
 
 def least_noise(dataset: Dataset, channel: str) -> np.ndarray:
-    """(n,) noise of the samples of a channel that is taken at least, rad or N m: as given, else a small share of its signal."""
+    """(n,) noise of the samples of a channel that is taken at least, rad or N m: as given, else a small share of its
+    signal."""
     given = given_noise(dataset, channel)
     if given is not None:
         return given
@@ -166,10 +172,13 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
         setup, result = under_noise_that_is_left(dataset, setup, result, progress)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
-        raise DataError("positions", dataset.name, found, "rad or m on the link side, of the robot that is named") from err
+        raise DataError(
+            "positions", dataset.name, found, "rad or m on the link side, of the robot that is named"
+        ) from err
     as_recorded = setup.problem
     for _ in range(RENEWALS):
-        # What is missing in a model that is far from the data would be taken off with what swings, as far as a few numbers can do it.
+        # What is missing in a model that is far from the data would be taken off with what swings, as far as a few
+        # numbers can do it.
         if result.chi2_per_dof > FAINT or not np.any(drifting(setup.problem.groups)):
             break
         setup = replace(setup, problem=without_swings(as_recorded, result))
@@ -182,7 +191,8 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
         result = renewed(problem, result, progress)
     if any(g.known_noise is not None for g in problem.groups):
         result = renewed(problem, result, progress)
-        # Few records are held out: all that the model is fitted to tell the noise better than the end of their own transients.
+        # Few records are held out: all that the model is fitted to tell the noise better than the end of their own
+        # transients.
         held_out = tuple(replace(g, U_noise=None, Q_noise=None) for g in held_out)
     # Where periods differ by a drift, as those of a motor that sticks do, what they differ by is no noise.
     share = 0.0 if np.any(drifting(setup.problem.groups)) else result.share
@@ -191,7 +201,9 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
 
 def whitened(problem: Problem, result: Fit, found: Sequence[Prediction]) -> list[np.ndarray]:
     """(S, K, n + M) of what a fit leaves, under its weights, by group; ``found`` is what it predicts."""
-    return [result.weights.apply(i, output_error(g, p)) for i, (g, p) in enumerate(zip(problem.groups, found, strict=True))]
+    return [
+        result.weights.apply(i, output_error(g, p)) for i, (g, p) in enumerate(zip(problem.groups, found, strict=True))
+    ]
 
 
 def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
@@ -202,14 +214,17 @@ def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fi
         return problem
     found = predictions(problem, result.model, result.remainders)
     factor = np.sqrt(unexcited_noise(problem.groups, whitened(problem, result, found)))
-    q_std, tau_std = (std * factor if guess else std for std, guess in zip((problem.q_std, problem.tau_std), guessed, strict=True))
+    q_std, tau_std = (
+        std * factor if guess else std for std, guess in zip((problem.q_std, problem.tau_std), guessed, strict=True)
+    )
     return replace(problem, q_std=q_std, tau_std=tau_std) if factor > 1.0 else problem
 
 
 def under_noise_that_is_left(
     dataset: Dataset, setup: Setup, result: Fit, progress: Callable[[str], None] | None = None
 ) -> tuple[Setup, Fit]:
-    """The setup under ``with_noise_that_is_left`` of a fit, and the first model under it; both as they are where that is no less.
+    """The setup under ``with_noise_that_is_left`` of a fit, and the first model under it; both as they are where that
+    is no less.
 
     ``result`` is the first model, or one extended by causes: the more it explains, the more its residual tells.
     """
@@ -226,7 +241,8 @@ def under_noise_that_is_left(
 def under_noise_beside_causes(
     dataset: Dataset, setup: Setup, result: Fit, progress: Callable[[str], None] | None = None
 ) -> tuple[Setup, Fit]:
-    """The same beside the causes that ``result`` has: of noise that was raised to what lines show that nothing excites, no more than is left.
+    """The same beside the causes that ``result`` has: of noise that was raised to what lines show that nothing excites,
+    no more than is left.
 
     A ripple of the gear shows at those lines as at the others, and looks like noise as long as it is missing.
     """
@@ -251,10 +267,11 @@ def guessed_noise(dataset: Dataset) -> list[bool]:
 
 
 def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
-    """Noise of the torque that was guessed, lowered to what a fit leaves where that is far less and periods show no scatter.
+    """Noise of the torque that was guessed, lowered to what a fit leaves where that is far less and periods show no
+    scatter.
 
-    Differences of samples tell what circulates in the loop too: a differentiating controller makes of the noise of the encoder
-    ten times that of the torque sensor and more, which cancels in the torque residual.
+    Differences of samples tell what circulates in the loop too: a differentiating controller makes of the noise of the
+    encoder ten times that of the torque sensor and more, which cancels in the torque residual.
     """
     if not guessed_noise(dataset)[1] or any(g.shows_noise for g in problem.groups):
         return problem
@@ -268,7 +285,9 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
         assumed = np.diagonal(result.weights.covariance[i], axis1=1, axis2=2)[:, :n].real
         left.append(output_error(group, pred)[..., :n] * np.sqrt(2.0 / assumed))
     # Lines of a motion are seen through its window: their squares are told in units of the numbers that they are.
-    mean = np.concatenate([np.abs(X[:, 1:, :n]).reshape(-1, n) ** 2 for X in whitened(problem, result, found)]).mean(axis=0)
+    mean = np.concatenate([np.abs(X[:, 1:, :n]).reshape(-1, n) ** 2 for X in whitened(problem, result, found)]).mean(
+        axis=0
+    )
     unit = np.sqrt(result.costs / result.counts / np.maximum(mean, 1e-300))
     power = DOUBT * torque_noise_left([X * unit for X in left], shares)
     if np.all(LOUD * power > 1.0):
@@ -278,12 +297,15 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
 
 
 def with_known_noise(problem: Problem) -> Problem:
-    """What noise adds to costs, of records of a single period whose noise is measured, by its levels: no periods differ there."""
+    """What noise adds to costs, of records of a single period whose noise is measured, by its levels: no periods differ
+    there."""
 
     def known(group: Group) -> Group:
         if group.window is not None or group.U_noise is None:
             return group
-        return replace(group, known_noise=tuple(std**2 / problem.samples(group) for std in (problem.tau_std, problem.q_std)))
+        return replace(
+            group, known_noise=tuple(std**2 / problem.samples(group) for std in (problem.tau_std, problem.q_std))
+        )
 
     return replace(problem, groups=tuple(map(known, problem.groups)))
 

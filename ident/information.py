@@ -142,7 +142,7 @@ def _chunk(structure: Structure, par: Parameters, lins: list[Linearisation], giv
     power, direction, size = _terms(structure, par)
     T = (omega ** np.arange(5)[:, None]) @ np.ascontiguousarray(X).view(float).reshape(Q, F, -1)
     T = T.view(complex).reshape(Q, 5, *X.shape[1:])
-    phase = (-1j) ** power[:, None] * 1j ** power
+    phase = (-1j) ** power[:, None] * 1j**power
     T = T[:, power[:, None] + power, direction[:, None], direction] * phase
     return 2.0 * np.outer(size, size) * T.real
 

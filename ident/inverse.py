@@ -107,9 +107,7 @@ def make_plane(structure: Structure, par: Parameters, group: Group, sampling: Sa
     return plane_at(structure, par, lin, group, np.exp(1j * group.omega * par.timing) / hold)
 
 
-def plane_at(
-    structure: Structure, par: Parameters, lin: Linearisation, group: Group, record: np.ndarray
-) -> Plane:
+def plane_at(structure: Structure, par: Parameters, lin: Linearisation, group: Group, record: np.ndarray) -> Plane:
     """The linear arm at a given linearisation; ``record`` (L,) as in ``Plane``."""
     s = 1j * group.omega
     Z, A_inv, C = impedance(structure, par, lin, s)
@@ -125,7 +123,8 @@ def plane_at(
 def true_position(
     group: Group, par: Parameters, sampling: Sampling, passed: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> np.ndarray:
-    """Motor position without what the images of the held torque add; (S, L, n) rad. ``passed`` as of ``alias_response``."""
+    """Motor position without what the images of the held torque add; (S, L, n) rad. ``passed`` as of
+    ``alias_response``."""
     alias = alias_response(group.omega, sampling.sample_time, sampling.hold, passed).reshape(len(group.omega), -1)
     return group.Q - alias * group.U / par.inertia
 
@@ -273,9 +272,7 @@ def _solution(
     return Solution(Q, Q_a, Q_driven, delta, tau_s, plane.record[:, None] * U, W, torques)
 
 
-def baseline_products(
-    structure: Structure, par: Parameters, plane: Plane, solution: Solution, top: int
-) -> Products:
+def baseline_products(structure: Structure, par: Parameters, plane: Plane, solution: Solution, top: int) -> Products:
     """Derivative of the predicted outputs by the log-parameters, at lines 0..top-1.
 
     Torques of effects and the geometric remainder are held. Columns in the order of the parameters.
@@ -296,9 +293,7 @@ def baseline_products(
         ],
         axis=-1,
     )
-    signals = np.concatenate(
-        [solution.delta[:, :top], solution.Q[:, :top], solution.Q_a[:, :top, elastic]], axis=-1
-    )
+    signals = np.concatenate([solution.delta[:, :top], solution.Q[:, :top], solution.Q_a[:, :top, elastic]], axis=-1)
     k, e = np.arange(n), 2 * n + np.arange(len(elastic))
     return Products(gains, signals, np.concatenate([k, k, n + k, n + k, e, e]))
 

@@ -42,7 +42,8 @@ def law_noise(pred: Prediction, group: Group) -> np.ndarray:
 
 
 def loop_noise(pred: Prediction, group: Group) -> np.ndarray | None:
-    """(L, n, n) covariance beyond that of the linear arm of what laws leave that move the arm; None where there are none.
+    """(L, n, n) covariance beyond that of the linear arm of what laws leave that move the arm; None where there are
+    none.
 
     A gear that is stiff now and loose then passes the noise of the position on with each in turn: what its mean slope
     passes on is less, and at other lines. By ``NOISE_DRAWS`` over all records, of the torque at the law; no more than
@@ -85,7 +86,8 @@ def loop_noise(pred: Prediction, group: Group) -> np.ndarray | None:
 
 
 def record_noise(pred: Prediction, group: Group) -> np.ndarray | None:
-    """(L, n, n) covariance beyond that of the linear arm where gears answer to the recorded torque; None where none does.
+    """(L, n, n) covariance beyond that of the linear arm where gears answer to the recorded torque; None where none
+    does.
 
     Of all that noise leaves through laws, those at the motors too: by ``NOISE_DRAWS`` over all records.
     """
@@ -138,9 +140,13 @@ def _place_of(effects: Sequence[Effect], pred: Prediction, solution: Solution) -
     compliance, moved = plane.A_inv[:, c, c], motion_per_position(pred.structure, pred.par, plane, j, gear=gear)
     if gear:
         laws = tuple(e.hypothesis.law(e.p, None, pred.par.stiffness[j]) for e in effects)
-        return _Place(laws, solution.delta[..., j], solution.torques.spring[..., j], compliance, moved, plane.spring_gain[:, :, j])
+        return _Place(
+            laws, solution.delta[..., j], solution.torques.spring[..., j], compliance, moved, plane.spring_gain[:, :, j]
+        )
     laws = tuple(e.hypothesis.options["loop"](e.p) for e in effects)
-    return _Place(laws, solution.Q_driven[..., j], solution.torques.link[..., c], compliance, moved, plane.link_gain[:, :, c])
+    return _Place(
+        laws, solution.Q_driven[..., j], solution.torques.link[..., c], compliance, moved, plane.link_gain[:, :, c]
+    )
 
 
 def _along(laws: Sequence[kernels.Law], group: Group, motion: np.ndarray) -> np.ndarray:

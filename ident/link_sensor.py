@@ -21,7 +21,9 @@ from ident.problem import Problem
 
 SURE = 5.0  # standard deviations from which a delay is one
 LEAST = 0.02  # delay in samples that is worth a name
-CLEAR = 0.1  # delay in samples from which little else looks like it: viscous friction of the link winds the gear up by its velocity too
+# delay in samples from which little else looks like it: viscous friction of the link winds the gear up by its velocity
+# too
+CLEAR = 0.1
 EXPLAINED = 0.5  # share of what stiffness and lost motion leave that it must explain
 BLOCKS = 12  # of lines, left out one after another for the standard deviation
 SMOOTH = 8  # lines on either side over which the remaining power is averaged

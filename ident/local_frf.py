@@ -179,7 +179,9 @@ def _fit(window: Window, order: int, poles: int, point: str) -> Local:
     powers = x[:, None] ** np.arange(order + 1)
     size = np.sqrt(np.mean(np.abs(window.R[:, window.excited]) ** 2, axis=(0, 1)))
     if not np.all(size > 0):
-        raise DataError("r", f"operating point {point}", "an input without excitation", "all inputs excited in every window")
+        raise DataError(
+            "r", f"operating point {point}", "an input without excitation", "all inputs excited in every window"
+        )
     R = window.R / size
     # Columns: references times powers of the offset, the plain references first; a transient for each record.
     by_reference = (powers[None, :, :, None] * R[:, :, None, :]).reshape(E * B, -1)
@@ -198,7 +200,9 @@ def _fit(window: Window, order: int, poles: int, point: str) -> Local:
         error = target - Q @ (Q.conj().T @ target)
         scale = np.maximum(np.sqrt(np.mean(np.abs(error) ** 2, axis=0)), 1e-12 * scale)
     if np.abs(np.diag(upper)).min() < 1e-9 * np.abs(np.diag(upper)).max():
-        raise DataError("r", f"operating point {point}", "inputs that are not excited independently", "random phases in all")
+        raise DataError(
+            "r", f"operating point {point}", "inputs that are not excited independently", "random phases in all"
+        )
     pick = np.linalg.inv(upper)[:n] @ Q.conj().T / size[:, None]
     N = (pick @ target).T
     G = N[n:] @ np.linalg.inv(N[:n])

@@ -64,7 +64,8 @@ def is_along_record(h: Hypothesis) -> bool:
 
 
 def has_rough_law(model: Model) -> bool:
-    """Whether a law along the record, or one under which single records may be in another steady motion, leaves more than noise itself."""
+    """Whether a law along the record, or one under which single records may be in another steady motion, leaves more
+    than noise itself."""
     return any(is_along_record(e.hypothesis) or "bends" in e.hypothesis.options for e in model.effects)
 
 

@@ -24,8 +24,8 @@ class Torques:
 class Solution:
     """A prediction and its parts; spectra of (S, L, .).
 
-    ``Q_a`` holds all coordinates of the links, ``Q_driven`` those that the joints drive, in their order. ``signals``: in time,
-    what was made of any of these but ``U`` already.
+    ``Q_a`` holds all coordinates of the links, ``Q_driven`` those that the joints drive, in their order. ``signals``:
+    in time, what was made of any of these but ``U`` already.
     """
 
     Q: np.ndarray
@@ -41,11 +41,12 @@ class Solution:
 
 @dataclass(frozen=True)
 class Motion:
-    """Time signals of a solution, made where they are first asked for; each (S, T) on the group's grid, not to be written to.
+    """Time signals of a solution, made where they are first asked for; each (S, T) on the group's grid, not to be
+    written to.
 
     ``beside``: spectra (S, L, n) of what else acts at the motors, N m. ``error``: the same, rad, by which the position
-    that laws see is taken off. ``delivered``: the same, N m, what the motors deliver by the record; the record itself where None.
-    ``told``: joints at which the record says another torque already, and none of a friction at rest.
+    that laws see is taken off. ``delivered``: the same, N m, what the motors deliver by the record; the record itself
+    where None. ``told``: joints at which the record says another torque already, and none of a friction at rest.
     """
 
     group: Group
@@ -58,7 +59,8 @@ class Motion:
     asked_of: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """A signal (S, T) of the solution, which is made once: laws ask for it again with every step of their parameters."""
+        """A signal (S, T) of the solution, which is made once: laws ask for it again with every step of their
+        parameters."""
         if self.solution is None or isinstance(self.error, np.ndarray):
             return make()
         signals = self.solution.signals
@@ -134,7 +136,8 @@ class Motion:
         return self.group.to_time(left[..., None])[..., 0]
 
     def asked_noise(self, joint: int) -> float:
-        """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean over records."""
+        """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean
+        over records."""
         return float(np.sqrt(2.0 * np.sum(self._asked_noise(joint))))
 
     def _asked_noise(self, joint: int) -> np.ndarray:

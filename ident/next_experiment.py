@@ -43,11 +43,17 @@ MANY = 1000.0  # nats above which their number says no more: it is of first orde
 ADVICE = {
     frozenset({"coulomb_friction", "stribeck_friction"}): "a slow sweep at constant speed in both directions",
     frozenset({"coulomb_friction", "presliding_friction"}): "the same excitation at a quarter of the amplitude",
-    frozenset({"backlash", "softening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
-    frozenset({"backlash", "hardening_stiffness"}): "the same posture at three levels of amplitude, and one where gravity loads the joint",
+    frozenset(
+        {"backlash", "softening_stiffness"}
+    ): "the same posture at three levels of amplitude, and one where gravity loads the joint",
+    frozenset(
+        {"backlash", "hardening_stiffness"}
+    ): "the same posture at three levels of amplitude, and one where gravity loads the joint",
     frozenset({"torque_delay", "torque_lag"}): "a band up to a third of the sample rate",
     frozenset({"sensor_delay", "sensor_lag"}): "a band up to a third of the sample rate",
-    frozenset({"cogging", "transmission_error"}): "the same posture with excitation near the resonance, over a whole period of the ripple",
+    frozenset(
+        {"cogging", "transmission_error"}
+    ): "the same posture with excitation near the resonance, over a whole period of the ripple",
     frozenset({"payload", "link_inertia"}): "static torques in postures that turn the last link against gravity",
 }
 
@@ -95,7 +101,9 @@ def separating_experiment(problem: Problem, result: Attribution) -> NextExperime
     o = options[best]
     robot = problem.structure.robot
     unit = "m" if linear_joints(robot)[o.joint] else "rad"
-    where = f"the posture of {o.group.operating_point}" + (f" with {robot.joint_names[o.joint]} moved by {o.shift:+g} {unit}" if o.shift else "")
+    where = f"the posture of {o.group.operating_point}" + (
+        f" with {robot.joint_names[o.joint]} moved by {o.shift:+g} {unit}" if o.shift else ""
+    )
     size = "the same amplitude" if o.factor == 1.0 else f"{o.factor:g} times the amplitude"
     expected = f"{nats[best]:.0f}" if nats[best] < MANY else f"more than {MANY:.0f}"
     text = f"To tell {names}: {where}, at {size}; expected to give {expected} nats between them (next_plan.toml)."
@@ -206,5 +214,7 @@ def advice(causes: Sequence[Cause], unknown: bool, axes: int) -> str | None:
             what = ADVICE.get(frozenset({cause.effect, other.effect}), f"{postures} and a second level of amplitude")
             return f"To tell {cause.effect} from {other.effect} at {cause.joint}: {what}."
     if unknown:
-        return f"Two more levels of amplitude and {postures}, to see how the unknown cause scales with motion and {load}."
+        return (
+            f"Two more levels of amplitude and {postures}, to see how the unknown cause scales with motion and {load}."
+        )
     return None

@@ -30,7 +30,8 @@ DOUBT = 1.5  # of the power of noise, by which what such lines hold may be too l
 SURE = 1.0  # standard deviations of that power, from the number of such lines
 HALVINGS, LEAST_POWER = 24, 1e-9  # of the interval of that power, and the least that a line is assumed to hold
 BAND_LINES = 20  # of a band in which a quantile, or the coherence of neighbouring lines, is taken
-TOGETHER, NO_CHANCE = 0.8, 5.0  # coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
+# coherence of neighbouring lines from which noise is a drift; and standard deviations of it by chance
+TOGETHER, NO_CHANCE = 0.8, 5.0
 
 
 def white_covariance(Z: np.ndarray, tau_var: np.ndarray | float, q_var: np.ndarray) -> np.ndarray:
@@ -72,7 +73,9 @@ def residual_covariance(
         return S[: group.n_compared]
     d, lines, dof_line = found
     Zk = Z[: group.n_compared]
-    tau_var, q_var = group.known_noise or _white_levels(np.sum(np.abs(d[:, 1:]) ** 2, axis=0), Zk[lines[1:]], np.full(len(lines) - 1, dof_line))
+    tau_var, q_var = group.known_noise or _white_levels(
+        np.sum(np.abs(d[:, 1:]) ** 2, axis=0), Zk[lines[1:]], np.full(len(lines) - 1, dof_line)
+    )
     S = white_covariance(Zk, tau_var + rounded, q_var)
     root = np.linalg.cholesky(S)
     white = np.linalg.solve(root[lines][None], d[..., None])[..., 0]
@@ -89,8 +92,8 @@ def residual_covariance(
 def _scatter(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
     """What noise alone makes of the torque residual: (R, J, n) of which the sum of squares is the variance of the mean.
 
-    With the lines (J,) of the period that it stands at, and its degrees of freedom per line. By what periods differ by, or the
-    end of a transient one and a single steady one; None where there is neither.
+    With the lines (J,) of the period that it stands at, and its degrees of freedom per line. By what periods differ by,
+    or the end of a transient one and a single steady one; None where there is neither.
     """
     P = group.U_periods.shape[1]
     if P > 1:
@@ -105,10 +108,13 @@ def _scatter(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float
     return d / np.sqrt(len(d)), lines, len(d) / WINDOWED
 
 
-def sample_noise(groups: Sequence[Group], impedances: Sequence[np.ndarray], samples: Sequence[int]) -> tuple[np.ndarray, np.ndarray] | None:
+def sample_noise(
+    groups: Sequence[Group], impedances: Sequence[np.ndarray], samples: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Standard deviation of white noise on torque and position samples, (n,) each.
 
-    From what shows the noise of the torque residual alone (``_scatter``), in all groups together; None where nothing does.
+    From what shows the noise of the torque residual alone (``_scatter``), in all groups together; None where nothing
+    does.
 
     Args:
         impedances: (L, n, n) recorded torque per motor position, by group.
@@ -132,8 +138,8 @@ def sample_noise(groups: Sequence[Group], impedances: Sequence[np.ndarray], samp
 def _white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Channel variances, (n,) each, of the line power (K, n) of the residual.
 
-    Few lines may be likeliest without any noise of the torque: beside the likeliest noise of the positions its mean over all levels
-    that are likely is taken.
+    Few lines may be likeliest without any noise of the torque: beside the likeliest noise of the positions its mean
+    over all levels that are likely is taken.
 
     Args:
         dof: (K,) degrees of freedom of the lines.
@@ -150,10 +156,12 @@ def _white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray) -> tuple[np
 
 
 def likeliest_levels(power: np.ndarray, gain: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Variances of torque and position, (n,) each, that are likeliest of the line power (K, n) of ``torque + gain @ position``.
+    """Variances of torque and position, (n,) each, that are likeliest of the line power (K, n) of ``torque + gain @
+    position``.
 
-    Powers of lines of noise are gamma distributed about their mean ``m``: ``sum(weight (log m + power / m))`` is least (Whittle 1953), by
-    multiplicative steps, under which variances stay positive (Fevotte, Bertin and Durrieu, Neural Comput. 21, 2009, eq. 4.7).
+    Powers of lines of noise are gamma distributed about their mean ``m``: ``sum(weight (log m + power / m))`` is least
+    (Whittle 1953), by multiplicative steps, under which variances stay positive (Fevotte, Bertin and Durrieu, Neural
+    Comput. 21, 2009, eq. 4.7).
 
     Args:
         gain: (K, n, n); weight: (K, 1) degrees of freedom.
@@ -172,9 +180,11 @@ def likeliest_levels(power: np.ndarray, gain: np.ndarray, weight: np.ndarray) ->
 
 
 def _mean_level(power: np.ndarray, others: np.ndarray, dof: np.ndarray) -> np.ndarray:
-    """Mean (n,) over all levels of the torque noise, each as likely as it makes the power (K, n) of lines that hold other noise too.
+    """Mean (n,) over all levels of the torque noise, each as likely as it makes the power (K, n) of lines that hold
+    other noise too.
 
-    Integrals by the trapezoidal rule over the logarithm of the level, where it is not unlikely: many lines make that narrow.
+    Integrals by the trapezoidal rule over the logarithm of the level, where it is not unlikely: many lines make that
+    narrow.
     """
     least = np.log(np.maximum(np.min(power, axis=0), LEAST_VARIANCE))
 
@@ -199,11 +209,12 @@ def _moving_mean(x: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> float:
-    """Power of what a model leaves at the lines that nothing excites, over that of the noise it was whitened with; 1 where it is less.
+    """Power of what a model leaves at the lines that nothing excites, over that of the noise it was whitened with; 1
+    where it is less.
 
-    Noise that is neither given nor seen to scatter between periods is guessed from differences of samples, as white: where it is
-    coloured more is left, at excited lines and at the others alike. What a model lacks shows at those excited first: where
-    these hold ``FLAT`` times as much as the others nothing is said about noise, and 1 returned.
+    Noise that is neither given nor seen to scatter between periods is guessed from differences of samples, as white:
+    where it is coloured more is left, at excited lines and at the others alike. What a model lacks shows at those
+    excited first: where these hold ``FLAT`` times as much as the others nothing is said about noise, and 1 returned.
 
     Args:
         whitened: (S, K, n) residual by group, real and imaginary parts of unit variance.
@@ -222,12 +233,13 @@ def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> 
 
 
 def torque_noise_left(left: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> np.ndarray:
-    """Power of white noise of the torque samples that a model leaves room for, over that which was assumed; (n,), at most 1.
+    """Power of white noise of the torque samples that a model leaves room for, over that which was assumed; (n,), at
+    most 1.
 
-    What a model leaves is never less than noise. In each band of lines that power is sought at which a quantile is that of noise,
-    which what is missing in few of them moves little. Bands count by how far they narrow it down, so that the quietest count
-    most; ``SURE`` of its standard deviations are added, as where the noise of the positions hides it. Fewer lines than half a band
-    tell nothing.
+    What a model leaves is never less than noise. In each band of lines that power is sought at which a quantile is that
+    of noise, which what is missing in few of them moves little. Bands count by how far they narrow it down, so that the
+    quietest count most; ``SURE`` of its standard deviations are added, as where the noise of the positions hides it.
+    Fewer lines than half a band tell nothing.
 
     Args:
         left: (S, K, n) residual by group, each joint of unit mean power for noise as assumed.
@@ -240,7 +252,8 @@ def torque_noise_left(left: Sequence[np.ndarray], shares: Sequence[np.ndarray]) 
             power, torque = np.abs(Z[:, band]) ** 2, share[band]
             quiet = power_of_noise(power, torque)
             slope = np.mean(torque / (torque * quiet + 1.0 - torque), axis=0)
-            # Lines of noise have exponential powers, and a quantile of N of them varies by this (Kendall and Stuart 1977, 14.2).
+            # Lines of noise have exponential powers, and a quantile of N of them varies by this (Kendall and Stuart
+            # 1977, 14.2).
             relative = np.sqrt(QUIET / (1.0 - QUIET) / power[..., 0].size) / -np.log(1.0 - QUIET)
             weight = (slope / relative) ** 2
             found, told = found + weight * quiet, told + weight
@@ -249,7 +262,8 @@ def torque_noise_left(left: Sequence[np.ndarray], shares: Sequence[np.ndarray]) 
 
 
 def power_of_noise(power: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """The part of the assumed power of one of two noises at which the ``QUIET`` quantile of lines is that of noise; (n,), 0 to 1.
+    """The part of the assumed power of one of two noises at which the ``QUIET`` quantile of lines is that of noise;
+    (n,), 0 to 1.
 
     Args:
         power: (S, L, n) of the lines, over that of both noises as assumed.
@@ -267,9 +281,10 @@ def power_of_noise(power: np.ndarray, share: np.ndarray) -> np.ndarray:
 def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Coherence of what differs between periods from each line to the next.
 
-    Noise that is stationary over many periods has independent lines (Pintelon and Schoukens 2012, ch. 2): the coherence is about the
-    inverse root of the number of pairs then. What ends a period elsewhere than it began it, as a drift does, steps there: its lines
-    go together, as far up as they are above the other noise. A random walk has about a third, and so has what is left of a transient.
+    Noise that is stationary over many periods has independent lines (Pintelon and Schoukens 2012, ch. 2): the coherence
+    is about the inverse root of the number of pairs then. What ends a period elsewhere than it began it, as a drift
+    does, steps there: its lines go together, as far up as they are above the other noise. A random walk has about a
+    third, and so has what is left of a transient.
 
     Args:
         periods: spectra (S, P, L, n) of single periods by group, the mean left out.
@@ -291,7 +306,8 @@ def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarra
 
 
 def drifting(groups: Sequence[Group]) -> np.ndarray:
-    """Joints (n,) at which nearly all that differs between periods, of the torque or of the position in some band, is a drift.
+    """Joints (n,) at which nearly all that differs between periods, of the torque or of the position in some band, is a
+    drift.
 
     Of a drive that hunts between the steps of its encoder, in pulses that go together in all lines, nothing is told.
     """

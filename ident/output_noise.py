@@ -1,4 +1,5 @@
-"""Covariance of the compared lines by noise alone: of the samples, of laws that are not linear, and of laws along the record."""
+"""Covariance of the compared lines by noise alone: of the samples, of laws that are not linear, and of laws along the
+record."""
 
 from __future__ import annotations
 
@@ -49,7 +50,8 @@ def noise_of_laws(prediction: Prediction, group: Group) -> np.ndarray:
 def output_covariance(
     problem: Problem, group: Group, prediction: Prediction, of_laws: np.ndarray | None = None
 ) -> np.ndarray:
-    """Covariance of all outputs: noise of a motor position is in the torque and in what a link encoder differs by; (K, n + M, n + M)."""
+    """Covariance of all outputs: noise of a motor position is in the torque and in what a link encoder differs by; (K,
+    n + M, n + M)."""
     S = noise_covariance(problem, group, prediction, of_laws)
     n, links, samples = S.shape[-1], list(group.links), problem.samples(group)
     if not links:
@@ -69,7 +71,8 @@ def output_covariance(
 def _with_record(S: np.ndarray, more: np.ndarray) -> np.ndarray:
     """A covariance (K, n, n) and what answers to the record add to it, by draws.
 
-    At least ``LEAST_NOISE`` of the former in any direction, and ``LEAK`` of the largest: draws know directions to so much.
+    At least ``LEAST_NOISE`` of the former in any direction, and ``LEAK`` of the largest: draws know directions to so
+    much.
     """
     root = np.linalg.cholesky(S)
     half = np.linalg.solve(root, more)

@@ -1,4 +1,5 @@
-"""Outputs written beside their place and put into it at one stroke: whoever kills a run finds the old ones or the new."""
+"""Outputs written beside their place and put into it at one stroke: whoever kills a run finds the old ones or the
+new."""
 
 from __future__ import annotations
 
@@ -59,7 +60,8 @@ def take_place(new: Path, target: Path) -> None:
 
 
 def _shared(target: Path) -> bool:
-    """Whether others may stand or write in a folder, who would be left in the old one: then its files alone are replaced."""
+    """Whether others may stand or write in a folder, who would be left in the old one: then its files alone are
+    replaced."""
     return Path.cwd().is_relative_to(target) or not all(p.is_file() for p in target.iterdir())
 
 

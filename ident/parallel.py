@@ -99,7 +99,9 @@ class Workers:
             return map_threads(lambda item: function(self._told(item, label)), items)
         # Effects hold functions made on the spot, which the pickle of the standard library cannot send.
         packed = cloudpickle.dumps(function)
-        futures = [self.executor.submit(_run_packed, packed, cloudpickle.dumps(self._told(item, label))) for item in items]
+        futures = [
+            self.executor.submit(_run_packed, packed, cloudpickle.dumps(self._told(item, label))) for item in items
+        ]
         return [cloudpickle.loads(future.result()) for future in futures]
 
     def map_in_time(
@@ -160,6 +162,8 @@ def _dask(address: str) -> Iterator[Executor]:
     try:
         client = Client(f"tcp://{address}", timeout=ANSWER)
     except (OSError, ValueError) as err:
-        raise DataError("--executor", f"dask://{address}", "no scheduler that answers", "a running Dask scheduler") from err
+        raise DataError(
+            "--executor", f"dask://{address}", "no scheduler that answers", "a running Dask scheduler"
+        ) from err
     with client:
         yield client.get_executor(pure=False)

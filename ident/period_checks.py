@@ -40,6 +40,10 @@ def differing(s: Segment, channel: str) -> np.ndarray:
 
 def unrepeated(dataset: Dataset) -> list[str]:
     """What is surely wrong in the periods of a dataset: said of more than half of its multisines that have several."""
-    told = [(s.name, period_warnings(s, dataset)) for s in dataset.segments if s.kind == "multisine" and s.steady_periods > 1]
+    told = [
+        (s.name, period_warnings(s, dataset))
+        for s in dataset.segments
+        if s.kind == "multisine" and s.steady_periods > 1
+    ]
     wrong = [f"{name}: {text}" for name, found in told for text in found]
     return wrong[:1] if len(wrong) > 0.5 * len(told) else []

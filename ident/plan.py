@@ -166,7 +166,12 @@ def make_plan(
     runs = (points * min(levels_per_point or len(levels), len(levels)) + validation_points) * realizations
     check_size(runs * (experiments or robot.n) * period * periods, robot, "plan")
     if points < 1 or realizations < 1 or periods <= transient_periods or period < 64:
-        raise DataError("plan", "points, realizations, periods, period", "a number too small", "at least one of each, and a steady period")
+        raise DataError(
+            "plan",
+            "points, realizations, periods, period",
+            "a number too small",
+            "at least one of each, and a steady period",
+        )
     if not 0 < band_hz[0] < band_hz[1] < 0.5 * sample_rate:
         raise DataError("band_hz", "plan", str(band_hz), f"rising, below Nyquist {0.5 * sample_rate:g} Hz")
     if not levels or not all(0 < level <= 1e3 for level in levels):
@@ -182,7 +187,9 @@ def make_plan(
         lines, detection = np.union1d(lines, detection), detection[:0]
         lines = np.arange(lines[0], lines[-1] + 1) if grid == "all" and len(lines) else lines
     if not len(lines):
-        raise DataError("band_hz", "plan", str(band_hz), f"a band that holds odd multiples of {sample_rate / period:g} Hz")
+        raise DataError(
+            "band_hz", "plan", str(band_hz), f"a band that holds odd multiples of {sample_rate / period:g} Hz"
+        )
     excitation = Excitation(sample_rate, period, periods, transient_periods, lines, detection)
     if postures is None:
         postures = operating_points(robot, points + validation_points, rng)
@@ -243,4 +250,6 @@ def check_size(samples: int, robot: Robot, where: str) -> None:
         DataError: where ``samples`` of all joints are more than ``MOST_NUMBERS``.
     """
     if samples * robot.n > MOST_NUMBERS:
-        raise DataError("plan", where, f"{samples:.3g} samples of {robot.n} joints", f"at most {MOST_NUMBERS:g} numbers")
+        raise DataError(
+            "plan", where, f"{samples:.3g} samples of {robot.n} joints", f"at most {MOST_NUMBERS:g} numbers"
+        )

@@ -51,7 +51,9 @@ def plan_to_toml(plan: Plan, path: str | Path) -> None:
     }
     content = tomlkit.dumps(head)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=target.parent, prefix=f".{target.name}-", delete=False, encoding="utf-8") as file:
+    with tempfile.NamedTemporaryFile(
+        "w", dir=target.parent, prefix=f".{target.name}-", delete=False, encoding="utf-8"
+    ) as file:
         file.write(content)
     os.chmod(file.name, 0o644)
     os.replace(file.name, target)
@@ -80,7 +82,9 @@ def plan_from_toml(path: str | Path) -> Plan:
     entries, motions = tables(head, "experiment", where), tables(head, "trajectory", where)
     if not entries and not motions:
         raise DataError("[[experiment]]", where, "none, and no [[trajectory]]", "at least one to run")
-    samples = len(entries) * period * periods + sum(whole(m, "samples", where, low=2 * STRIDE, high=10**7) for m in motions)
+    samples = len(entries) * period * periods + sum(
+        whole(m, "samples", where, low=2 * STRIDE, high=10**7) for m in motions
+    )
     check_size(samples, robot, where)
     experiments = tuple(_experiment(e, x, robot, where) for e in entries)
     trajectories = tuple(_trajectory(m, robot, where) for m in motions)

@@ -94,7 +94,10 @@ def _loudest(problem: Problem, predictions: Sequence[Prediction], joint: int) ->
         else:
             # The return that closes a motion was not recorded.
             inside = np.flatnonzero(group.window > 0.5)
-            pick, top = inside[:: max(1, len(inside) // max(600, 3 * group.n_compared))], float(group.omega[group.n_compared - 1])
+            pick, top = (
+                inside[:: max(1, len(inside) // max(600, 3 * group.n_compared))],
+                float(group.omega[group.n_compared - 1]),
+            )
         records = []
         for q, v, a, r in zip(*(x[:, pick] for x in signals), strict=True):
             known = np.stack([np.ones_like(v), q - q.mean(), v, a, np.sign(v)], axis=1)
@@ -105,7 +108,8 @@ def _loudest(problem: Problem, predictions: Sequence[Prediction], joint: int) ->
 
 
 def _own_power(x: _Record, step: float, count: int) -> np.ndarray:
-    """Fall of the squared residual of a record by waves at multiples of ``step``, each where it lies in the compared band."""
+    """Fall of the squared residual of a record by waves at multiples of ``step``, each where it lies in the compared
+    band."""
     power = np.zeros(count)
     for first in range(1, count + 1, WAVES_AT_ONCE):
         n = step * np.arange(first, min(first + WAVES_AT_ONCE, count + 1))
@@ -119,7 +123,10 @@ def _own_power(x: _Record, step: float, count: int) -> np.ndarray:
         sizes = np.einsum("tk,tk->k", E, E.conj()).real, np.einsum("tk,tk->k", E, E)
         along = N.T @ E
         # What is known beforehand is orthonormal over all samples, of which a wave may have a part.
-        sizes = sizes[0] - np.einsum("mk,mk->k", along, along.conj()).real, sizes[1] - np.einsum("mk,mk->k", along, along)
+        sizes = (
+            sizes[0] - np.einsum("mk,mk->k", along, along.conj()).real,
+            sizes[1] - np.einsum("mk,mk->k", along, along),
+        )
         power[first - 1 : first - 1 + len(n)] = _fall(*sizes, r @ E, 1e-9 * len(r) ** 2)
     return power
 
@@ -144,7 +151,8 @@ def _refine(records: Sequence[_Record], center: float, width: float, count: int 
 
 
 def _seen(records: Sequence[_Record], wave_number: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Motor angle, what is known beforehand and residual of each record where a wave lies in the compared band; some thousand samples."""
+    """Motor angle, what is known beforehand and residual of each record where a wave lies in the compared band; some
+    thousand samples."""
     most = max(250, REFINED_SAMPLES // len(records))
     out = []
     for x in records:

@@ -1,8 +1,8 @@
 """What an arm does at another posture, to first order.
 
 Where a gear gives a little under the weight of the arm the torque that holds it up hardly changes, but all that the arm
-does elsewhere: its inertia there is another. Small motions about a posture are linear in it, so that one linearisation a
-coordinate tells what the geometric remainder would take steps to find.
+does elsewhere: its inertia there is another. Small motions about a posture are linear in it, so that one linearisation
+a coordinate tells what the geometric remainder would take steps to find.
 """
 
 from __future__ import annotations

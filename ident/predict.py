@@ -123,7 +123,9 @@ def runs_of(dataset: Dataset, *, role: str = "identification", amplitude: float 
     if spread is not None:
         skip = max(skip, first.period)
         if skip >= y.shape[1]:
-            raise DataError("periods", dataset.name, "a single one that begins in motion", "one to settle and one to count")
+            raise DataError(
+                "periods", dataset.name, "a single one that begins in motion", "one to settle and one to count"
+            )
     return Runs(np.stack([s.tau for s in chosen]), y, point, q0, skip, 1.0 / dataset.sample_rate, spread)
 
 

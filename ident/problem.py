@@ -29,8 +29,8 @@ class Problem:
         nominal: starting guesses, centre of the weak prior.
         tau_std, q_std: (n,) sample noise where single periods give no scatter.
         free_timing: whether a common timing offset is fitted.
-        scatter_share: of what the scatter between periods says that noise adds to costs, that is taken off where these are
-            compared; that which the baseline has borne, none before it is known.
+        scatter_share: of what the scatter between periods says that noise adds to costs, that is taken off where these
+            are compared; that which the baseline has borne, none before it is known.
     """
 
     structure: Structure

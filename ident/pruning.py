@@ -1,4 +1,5 @@
-"""What a model does not need: effects of which nothing is left, laws without what sets them apart, frictions that stood for a later cause."""
+"""What a model does not need: effects of which nothing is left, laws without what sets them apart, frictions that stood
+for a later cause."""
 
 from __future__ import annotations
 
@@ -19,14 +20,15 @@ from ident.rounds import MIN_EVIDENCE, Round
 from ident.torque_fit import Fit
 
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
-NEXT_TO_REST = 2.0  # velocity over that at which a motor may as well rest, up to which friction may stand for what holds it then
+# velocity over that at which a motor may as well rest, up to which friction may stand for what holds it then
+NEXT_TO_REST = 2.0
 
 
 def pruned(problem: Problem, current: Fit) -> Fit:
     """The model without effects of which nothing is left.
 
-    One that stood for a part of a cause as long as that had no name is not needed beside it; and one that won only since
-    the drives found a better place in its company says nothing: that place is the baseline's then.
+    One that stood for a part of a cause as long as that had no name is not needed beside it; and one that won only
+    since the drives found a better place in its company says nothing: that place is the baseline's then.
     """
     std = dict(zip(current.names, np.sqrt(np.maximum(np.diag(current.covariance()), 0.0)), strict=True))
 
@@ -38,7 +40,11 @@ def pruned(problem: Problem, current: Fit) -> Fit:
         off = [abs(q.to_internal(v) - q.to_internal(q.null)) / s for q, v, s in own if q.null is not None]
         # The wave number of a wave that is not there may look sure.
         wave = is_wave(h.parameters)
-        sizes = [s > (UNTOLD if q.log else 0.5 * abs(v)) for q, v, s in own if q.null is None and (not wave or q.name in WAVE)]
+        sizes = [
+            s > (UNTOLD if q.log else 0.5 * abs(v))
+            for q, v, s in own
+            if q.null is None and (not wave or q.name in WAVE)
+        ]
         return all(sizes) if sizes else all(x < ABSENT for x in off)
 
     effects = current.model.effects
@@ -55,7 +61,9 @@ def without_shadows(problem: Problem, current: Fit, rounds: Sequence[Round], wor
 
     They competed with no other hypothesis, and made up for that cause as long as it was missing.
     """
-    alone = {r.candidates[0].hypothesis.key for r in rounds if len(r.candidates) == 1 and r.before is not rounds[-1].before}
+    alone = {
+        r.candidates[0].hypothesis.key for r in rounds if len(r.candidates) == 1 and r.before is not rounds[-1].before
+    }
     doubted = [e.hypothesis for e in current.model.effects if e.hypothesis.key in alone]
     if not doubted or workers.late:
         return current
@@ -82,7 +90,9 @@ def without_shadows(problem: Problem, current: Fit, rounds: Sequence[Round], wor
 
 def renamed(rounds: Sequence[Round], before: Sequence[Effect], after: Sequence[Effect]) -> list[Round]:
     """Rounds whose winners have been replaced by their special cases, effect by effect."""
-    new = {a.hypothesis.key: b.hypothesis for a, b in zip(before, after, strict=True) if a.hypothesis is not b.hypothesis}
+    new = {
+        a.hypothesis.key: b.hypothesis for a, b in zip(before, after, strict=True) if a.hypothesis is not b.hypothesis
+    }
 
     def of(found: Round) -> Round:
         first, *others = found.candidates
@@ -135,8 +145,8 @@ def untold(result: Fit, effect: Effect) -> bool:
 def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
     """Whether an effect is its special case by its parameters, or beside laws along the record.
 
-    Along the record nothing says what friction takes of the torque while a motor rests: what a friction has within velocities at
-    which it may as well rest is an error of that.
+    Along the record nothing says what friction takes of the torque while a motor rests: what a friction has within
+    velocities at which it may as well rest is an error of that.
     """
     h = effect.hypothesis
     if h.options.get("plain", lambda p: False)(effect.p):
@@ -147,6 +157,10 @@ def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
 
     def unseen(group: Group) -> bool:
         rests = group.rest is not None and bool(np.any(group.rest[..., h.joint]))
-        return rests and h.joint in joints_along_record(model, group) and v < NEXT_TO_REST * group.least_velocity[:, h.joint].mean()
+        return (
+            rests
+            and h.joint in joints_along_record(model, group)
+            and v < NEXT_TO_REST * group.least_velocity[:, h.joint].mean()
+        )
 
     return all(map(unseen, problem.groups))

@@ -57,13 +57,18 @@ def find_steps(dataset: Dataset, q_std: np.ndarray) -> tuple[Steps, ...]:
 
 
 def with_rounding(
-    groups: Sequence[Group], steps: Sequence[Steps], dataset: Dataset, noise: tuple[np.ndarray, np.ndarray] | None = None
+    groups: Sequence[Group],
+    steps: Sequence[Steps],
+    dataset: Dataset,
+    noise: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[Group, ...]:
-    """Groups with the error that steps leave in their positions (``rounding_error``), less what scatters between periods as noise does.
+    """Groups with the error that steps leave in their positions (``rounding_error``), less what scatters between
+    periods as noise does.
 
     Args:
-        noise: (n,) sample noise of the position before it is rounded, and as it scatters in the torque residual, rad. Where None the latter is
-            taken from the positions, which move with what circulates in the loop too: that is no error, and too much is then taken off.
+        noise: (n,) sample noise of the position before it is rounded, and as it scatters in the torque residual, rad.
+            Where None the latter is taken from the positions, which move with what circulates in the loop too: that is
+            no error, and too much is then taken off.
     """
     if not steps:
         return tuple(groups)
@@ -77,7 +82,11 @@ def with_rounding(
             recorded = np.concatenate([segments[name].q[:, x.joint] for name in group.segments])
             at = x.resolution * np.angle(np.mean(np.exp(2j * np.pi * recorded / x.resolution))) / (2 * np.pi)
             error = rounding_error(group.Q[:, :, x.joint], x.resolution, at, samples, group.n_compared)
-            scatter = _varying(group, x.joint) if noise is None else (noise[1][x.joint] ** 2 - noise[0][x.joint] ** 2) / samples
+            scatter = (
+                _varying(group, x.joint)
+                if noise is None
+                else (noise[1][x.joint] ** 2 - noise[0][x.joint] ** 2) / samples
+            )
             rounding[:, x.joint] = error * max(1.0 - scatter / error.mean(), 0.0)
         out.append(replace(group, rounding=rounding))
     return tuple(out)
@@ -86,10 +95,11 @@ def with_rounding(
 def rounding_error(Q: np.ndarray, step: float, at: float, samples: int, lines: int) -> np.ndarray:
     """Variance (lines,) of a line of a position that comes in steps, rad2; mean over records.
 
-    It is white with ``step^2 / 12`` where samples are many steps apart (Widrow and Kollar 2008, ch. 19). Slow motion holds the low lines,
-    and motion with odd lines alone about the middle of a step the odd ones: the motion itself, its lines that stand out of such
-    errors, is rounded once more, and the power of what that changes taken in the mean over lines near by, even and odd ones apart. As the
-    motion holds errors of its own, which would not be made again, it is made smaller and larger.
+    It is white with ``step^2 / 12`` where samples are many steps apart (Widrow and Kollar 2008, ch. 19). Slow motion
+    holds the low lines, and motion with odd lines alone about the middle of a step the odd ones: the motion itself, its
+    lines that stand out of such errors, is rounded once more, and the power of what that changes taken in the mean over
+    lines near by, even and odd ones apart. As the motion holds errors of its own, which would not be made again, it is
+    made smaller and larger.
 
     Args:
         Q: (S, L) spectra of the position, rad.

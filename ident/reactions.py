@@ -75,7 +75,9 @@ def inner_torques(
             guess = old_link[..., c] - others
             noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=False))
             free = solution.Q_driven[..., j] + compliance * guess
-            at_link[j] = others + _loop(effect.hypothesis.options["loop"](effect.p), grid, free, noise, compliance, modes, guess)
+            at_link[j] = others + _loop(
+                effect.hypothesis.options["loop"](effect.p), grid, free, noise, compliance, modes, guess
+            )
         else:
             others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
@@ -96,7 +98,8 @@ def inner_torques(
 
 
 def motor_torques(par: Parameters, motion: Motion, effects: Sequence[Effect]) -> np.ndarray:
-    """Spectra (S, L, n) of the torques of effects at the motors; dry friction at rest balances what the others leave."""
+    """Spectra (S, L, n) of the torques of effects at the motors; dry friction at rest balances what the others
+    leave."""
     out = np.zeros_like(motion.solution.Q)
     for effect in sorted(effects, key=is_dry):
         h, j = effect.hypothesis, effect.hypothesis.joint
@@ -167,9 +170,7 @@ def _along_record(
     return said, gain * (torque - said)
 
 
-def _modes(
-    structure: Structure, par: Parameters, plane: Plane, group: Group, column: int
-) -> tuple[Group, np.ndarray]:
+def _modes(structure: Structure, par: Parameters, plane: Plane, group: Group, column: int) -> tuple[Group, np.ndarray]:
     """Time grid of a loop at a link coordinate, fine enough for the fastest mode, and the modes there."""
     D = np.diag(damping_diagonal(structure, par))
     K = np.diag(stiffness_diagonal(structure, par)) + plane.lin.Kg
@@ -181,13 +182,15 @@ def _modes(
 
 
 def motion_per_position(structure: Structure, par: Parameters, plane: Plane, joint: int, *, gear: bool) -> np.ndarray:
-    """(L, n) deflection of the gear of a joint per motor position, without laws; of its link where not of the ``gear``."""
+    """(L, n) deflection of the gear of a joint per motor position, without laws; of its link where not of the
+    ``gear``."""
     link = (plane.A_inv[:, structure.driven[joint], structure.driven] * plane.C) @ par.coupling
     return par.coupling[joint] - link if gear else link
 
 
 def noise_of_motion(group: Group, per_position: np.ndarray) -> np.ndarray:
-    """(L,) variance that noise of the positions has in a motion, rad2; none of a motion whose lines are seen through a window.
+    """(L,) variance that noise of the positions has in a motion, rad2; none of a motion whose lines are seen through a
+    window.
 
     Args:
         per_position: (L, n) of ``motion_per_position``.
@@ -212,8 +215,8 @@ def _loop(
     are signal; the others it answers with its mean slope.
 
     Args:
-        free: (S, L) where the arm would be without; noise: (L,) variance of its lines; compliance: (L,) of the arm there;
-            guess: (S, L) torque to begin with.
+        free: (S, L) where the arm would be without; noise: (L,) variance of its lines; compliance: (L,) of the arm
+            there; guess: (S, L) torque to begin with.
     """
     share = signal_share(free, noise)
     shown = share * free

@@ -22,14 +22,16 @@ from ident.transients import ends_of_transients
 from robot_assets.errors import DataError
 
 RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: what still rings then has decayed
-SETTLE_TIME, SETTLE_PERIODS = 0.5, 2.0  # tapered at both ends of a motion: s, and periods of the highest compared frequency, at least
+# tapered at both ends of a motion: s, and periods of the highest compared frequency, at least
+SETTLE_TIME, SETTLE_PERIODS = 0.5, 2.0
 BORDER_SAMPLES = 8  # at either end of a period, from which it is told where it begins and ends
 CREEP = 6.0  # standard deviations of their noise, by which both must differ
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
 MOTION_BAND = 1.5  # the same of motions
-FAST_BAND = 6.0  # of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
+# of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
+FAST_BAND = 6.0
 
 
 def build_groups(
@@ -75,7 +77,8 @@ def build_groups(
 
 
 def highest_line_hz(dataset: Dataset) -> float:
-    """Highest excited frequency of the identification multisines, Hz; of held-out ones where there are no others, 0.4 of Nyquist without."""
+    """Highest excited frequency of the identification multisines, Hz; of held-out ones where there are no others, 0.4
+    of Nyquist without."""
     excited = [s for s in dataset.select(kind="multisine") if len(s.excited_lines)]
     told = [s for s in excited if s.role == "identification"] or excited
     tops = [max(s.excited_lines) * dataset.sample_rate / s.period for s in told]
@@ -85,7 +88,8 @@ def highest_line_hz(dataset: Dataset) -> float:
 def start_times(dataset: Dataset) -> dict[str, float]:
     """When each segment began, s, by its name: as its time stamps say, or one after the other.
 
-    Where the clock was set back for a segment its stamps say nothing of when it was recorded; then the order in the dataset does.
+    Where the clock was set back for a segment its stamps say nothing of when it was recorded; then the order in the
+    dataset does.
     """
     segments = dataset.segments
     if all(b.t[0] >= a.t[-1] for a, b in itertools.pairwise(sorted(segments, key=lambda s: s.t[0]))):
@@ -152,8 +156,8 @@ def _middle_periods(members: list[Segment]) -> np.ndarray:
 def without_creep(x: np.ndarray) -> np.ndarray:
     """Periods (P, N, n) less the line that leads from where they begin to where they end, where that is elsewhere.
 
-    What ends elsewhere than it began, as a motor that sticks and creeps does, has lines of its jump. A steady velocity is a motion
-    of the arm too: less that, what is left repeats.
+    What ends elsewhere than it began, as a motor that sticks and creeps does, has lines of its jump. A steady velocity
+    is a motion of the arm too: less that, what is left repeats.
     """
     P, N, _ = x.shape
     if P < 2:
@@ -167,7 +171,8 @@ def without_creep(x: np.ndarray) -> np.ndarray:
 
 
 def _change(x: np.ndarray, width: int) -> np.ndarray:
-    """(n,) rms of what the mean of so many samples of (N, n) changes by from each to the next: that of a drive that hunts
+    """(n,) rms of what the mean of so many samples of (N, n) changes by from each to the next: that of a drive that
+    hunts
     between the steps of an encoder is far more than differences of single samples show, most of which are small."""
     means = x[: len(x) // width * width].reshape(-1, width, x.shape[1]).mean(axis=1)
     return np.sqrt(np.mean(np.diff(means, axis=0) ** 2, axis=0)) if len(means) > 1 else np.zeros(x.shape[1])

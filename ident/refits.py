@@ -1,4 +1,5 @@
-"""Fits of candidates: from where screening put them, to the end, in other weights, and from the other side of what is seen."""
+"""Fits of candidates: from where screening put them, to the end, in other weights, and from the other side of what is
+seen."""
 
 from __future__ import annotations
 
@@ -26,10 +27,11 @@ POLISH_STEPS = 40  # of the winner of a round
 
 
 def revived(problem: Problem, model: Model) -> Model:
-    """A model whose collapsed dampers and viscous friction are back at a size that a fit can move, and hinges free to turn on.
+    """A model whose collapsed dampers and viscous friction are back at a size that a fit can move, and hinges free to
+    turn on.
 
-    What a missing cause has driven towards nothing has no slope left in logarithmic coordinates; a hinge that has turned far from the
-    axis from which it was sought is sought from a nearer one.
+    What a missing cause has driven towards nothing has no slope left in logarithmic coordinates; a hinge that has
+    turned far from the axis from which it was sought is sought from a nearer one.
     """
     par, least = model.par, problem.nominal
     return replace(
@@ -68,7 +70,8 @@ def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:
 
 
 def left_by(found: Sequence[tuple[Hypothesis, Fit]], joints: np.ndarray | slice = slice(None)) -> float:
-    """Excess of the cost over noise that the best candidate leaves, at some ``joints`` or all; infinite where there is none."""
+    """Excess of the cost over noise that the best candidate leaves, at some ``joints`` or all; infinite where there is
+    none."""
     return min((float(np.sum((r.costs - r.counts)[joints])) for _, r in found), default=np.inf)
 
 
@@ -80,10 +83,11 @@ def refit(
     iterations: int = 10,
     most: float = np.inf,
 ) -> Fit | None:
-    """A candidate fitted from where screening put it; under the noise that it sees at the start where ``weights`` are None.
+    """A candidate fitted from where screening put it; under the noise that it sees at the start where ``weights`` are
+    None.
 
-    None where its model cannot be computed, costs more than ``most`` at the start, or ends where the data feel no change
-    of its last effect, if it has any.
+    None where its model cannot be computed, costs more than ``most`` at the start, or ends where the data feel no
+    change of its last effect, if it has any.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
@@ -104,8 +108,10 @@ def refit(
 
 
 def either_turn(problem: Problem, result: Fit, effect: Effect, iterations: int = 10) -> Fit:
-    """A fit with one of its effects, a dry friction that turns at once, as one that turns within a velocity that is seen, or the other
-    way round, where that costs less; no step of a fit leads from one to the other. As it is where the effect is another one."""
+    """A fit with one of its effects, a dry friction that turns at once, as one that turns within a velocity that is
+    seen, or the other
+    way round, where that costs less; no step of a fit leads from one to the other. As it is where the effect is another
+    one."""
     h = effect.hypothesis
     if not is_dry(effect):
         return result
@@ -130,7 +136,8 @@ def settled(current: Fit) -> bool:
 
 
 def under_own_noise(problem: Problem, result: Fit) -> Fit | None:
-    """A fit as it stands, its cost under the noise that its own model sees; None where drives gone astray make that infinite."""
+    """A fit as it stands, its cost under the noise that its own model sees; None where drives gone astray make that
+    infinite."""
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             preds = predictions(problem, result.model, result.remainders)

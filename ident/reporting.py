@@ -53,7 +53,9 @@ def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: 
     return tuple(sorted(found, key=lambda w: -w.share))
 
 
-def affected_joints(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.1) -> tuple[int, ...]:
+def affected_joints(
+    problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.1
+) -> tuple[int, ...]:
     """Joints that carry at least a share ``least`` of the whitened discrepancy."""
     names = problem.structure.robot.joint_names
     total = dict.fromkeys(names, 0.0)
@@ -62,9 +64,7 @@ def affected_joints(problem: Problem, fit: Fit, predictions: Sequence[Prediction
     return tuple(j for j, name in enumerate(names) if total[name] >= least)
 
 
-def spectrum_map(
-    problem: Problem, fit: Fit, before: Sequence[Prediction], after: Sequence[Prediction]
-) -> SpectrumMap:
+def spectrum_map(problem: Problem, fit: Fit, before: Sequence[Prediction], after: Sequence[Prediction]) -> SpectrumMap:
     """Rms torque residual by operating point, joint and band."""
     top = max(g.omega[g.n_compared - 1] for g in problem.groups) / 2 / np.pi
     edges = np.geomspace(max(top / 200, 0.05), top * 1.0001, BANDS + 1)
@@ -92,7 +92,9 @@ def frf_views(
     """
     try:
         frf = estimate_frf(dataset)
-        models = [estimate_frf(with_torque(dataset, problem, preds), estimator=frf.estimator) for preds in (before, after)]
+        models = [
+            estimate_frf(with_torque(dataset, problem, preds), estimator=frf.estimator) for preds in (before, after)
+        ]
     except DataError:
         return ()
     return tuple(
@@ -121,7 +123,8 @@ def with_torque(dataset: Dataset, problem: Problem, predictions: Sequence[Predic
 
 
 def torque_traces(groups: Sequence[Group], pairs: Sequence[tuple[Prediction, Prediction]]) -> tuple[TorqueTrace, ...]:
-    """Measured and predicted torque in time, for the first segment of each group; of a motion without its ends, which are not compared."""
+    """Measured and predicted torque in time, for the first segment of each group; of a motion without its ends, which
+    are not compared."""
     out = []
     for group, (a, b) in zip(groups, pairs, strict=True):
         signals = []
@@ -151,7 +154,8 @@ LABELS = {
 def evidence_plot(
     problem: Problem, fit: Fit, predictions: Sequence[Prediction], effect: Effect, cause: int
 ) -> EvidencePlot:
-    """Residual torque without one effect, the ``cause`` of that number, against the variable that explains it, and with it.
+    """Residual torque without one effect, the ``cause`` of that number, against the variable that explains it, and with
+    it.
 
     Of a gear whose link encoder is compared, what that shows beside the model: its torque hardly does.
     """

@@ -12,7 +12,8 @@ REST_NOISE = 6.0  # beyond this many standard deviations of its noise
 
 
 def at_rest(q: np.ndarray, fs: float, span: float) -> np.ndarray:
-    """Where motors stand still (N, n): samples in windows of ``span`` seconds that hold no more than noise, or a step of the encoder."""
+    """Where motors stand still (N, n): samples in windows of ``span`` seconds that hold no more than noise, or a step
+    of the encoder."""
     return _still(q, max(round(span * fs), REST_SAMPLES), _stillness(q, 1), "nearest")
 
 
@@ -23,14 +24,16 @@ def at_rest_in_period(q: np.ndarray, fs: float, span: float) -> np.ndarray:
 
 
 def _stillness(q: np.ndarray, count: int) -> np.ndarray:
-    """(n,) what means over ``count`` positions (N, n) of motors that stand still differ by, rad: noise, or a step of the encoder."""
+    """(n,) what means over ``count`` positions (N, n) of motors that stand still differ by, rad: noise, or a step of
+    the encoder."""
     steps = np.abs(np.diff(q, axis=0))
     least = np.min(np.where(steps > 0, steps, np.inf), axis=0)
     return np.maximum(REST_NOISE * difference_noise(q) / np.sqrt(count), np.where(np.isfinite(least), 1.5 * least, 0.0))
 
 
 def lasting(rest: np.ndarray, width: int) -> np.ndarray:
-    """Where a motor rests (S, n_time, n) for ``width`` points at least: in a turn the velocity says more than the torque."""
+    """Where a motor rests (S, n_time, n) for ``width`` points at least: in a turn the velocity says more than the
+    torque."""
     narrow = scipy.ndimage.minimum_filter1d(rest.astype(np.uint8), width, axis=1, mode="nearest")
     return scipy.ndimage.maximum_filter1d(narrow, width, axis=1, mode="nearest", origin=-1 if width % 2 == 0 else 0) > 0
 
@@ -55,7 +58,9 @@ def turning(group: Group) -> np.ndarray:
 
 def _still(q: np.ndarray, width: int, level: np.ndarray, mode: str) -> np.ndarray:
     """Samples (N, n) in windows of ``width`` within which positions differ by no more than ``level``."""
-    span = scipy.ndimage.maximum_filter1d(q, width, axis=0, mode=mode) - scipy.ndimage.minimum_filter1d(q, width, axis=0, mode=mode)
+    span = scipy.ndimage.maximum_filter1d(q, width, axis=0, mode=mode) - scipy.ndimage.minimum_filter1d(
+        q, width, axis=0, mode=mode
+    )
     # An even window reaches one sample further back than ahead: the windows that hold a sample reach the other way.
     origin = -1 if width % 2 == 0 else 0
     return scipy.ndimage.maximum_filter1d((span <= level).astype(np.uint8), width, axis=0, mode=mode, origin=origin) > 0

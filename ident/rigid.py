@@ -49,7 +49,8 @@ class RigidFit:
         par: starting parameters with the motor inertia and viscous friction found.
         std: (bodies, 10) of the inertial parameters, in the order of ``pin.Inertia.toDynamicParameters``.
         bodies: joints of the description that carry the bodies.
-        rank: combinations that the motions show, of the 10 parameters of each body, motor inertias and viscous frictions.
+        rank: combinations that the motions show, of the 10 parameters of each body, motor inertias and viscous
+            frictions.
         left: (n,) rms torque that is left in the band, N m.
     """
 
@@ -101,18 +102,16 @@ def fit_rigid(structure: Structure, nominal: Parameters, groups: Sequence[Group]
         elasticities=structure.hinges,
         inertias={name: pin.Inertia.FromDynamicParameters(p) for name, p in zip(names, pi, strict=True)},
     )
-    par = replace(
-        nominal, inertia=np.exp(x[COORDINATES * B :][:n]), viscous=np.exp(x[COORDINATES * B + n :])
-    )
+    par = replace(nominal, inertia=np.exp(x[COORDINATES * B :][:n]), viscous=np.exp(x[COORDINATES * B + n :]))
     return RigidFit(changed, par, std, names, problem.rank(), rms)
 
 
 def carried_over(structure: Structure, nominal: Parameters, groups: Sequence[Group]) -> float:
     """What inertias found leave of parts of the motions that were left out, over what those described leave there.
 
-    ``PARTS`` of every motion are left out in turn; of the squares of the torque at each joint a geometric mean over the joints.
-    Above 1 the motions are too short or too poor for so many parameters, however well these fit. Motor inertia, friction and
-    offset are fitted under both.
+    ``PARTS`` of every motion are left out in turn; of the squares of the torque at each joint a geometric mean over the
+    joints. Above 1 the motions are too short or too poor for so many parameters, however well these fit. Motor inertia,
+    friction and offset are fitted under both.
 
     Args:
         structure, nominal, groups: as of ``fit_rigid``.
@@ -143,7 +142,9 @@ def _cut(group: Group, part: int, inside: bool) -> Group:
     return replace(group, window=group.window * np.sin(0.5 * np.pi * fade) ** 2)
 
 
-def _left_with(model: pin.Model, indices: Sequence[int], given: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> np.ndarray:
+def _left_with(
+    model: pin.Model, indices: Sequence[int], given: Sequence[np.ndarray], other: Sequence[np.ndarray]
+) -> np.ndarray:
     """(n,) squares left of ``other`` by bodies of a model with drives fitted to ``given``, both as of ``_rows``."""
     bodies = np.concatenate([model.inertias[i].toDynamicParameters() for i in indices])
 
@@ -156,9 +157,7 @@ def _left_with(model: pin.Model, indices: Sequence[int], given: Sequence[np.ndar
     return np.sum((y_other - np.einsum("rjc,jc->rj", X_other, drives)) ** 2, axis=0)
 
 
-def _rows(
-    structure: Structure, coupling: np.ndarray, group: Group, indices: Sequence[int]
-) -> tuple[np.ndarray, ...]:
+def _rows(structure: Structure, coupling: np.ndarray, group: Group, indices: Sequence[int]) -> tuple[np.ndarray, ...]:
     """What a motion tells: its torque and the columns of that, through the same window and band, R real rows.
 
     Returns:

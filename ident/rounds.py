@@ -28,9 +28,11 @@ from ident.strong import beside_strong
 from ident.torque_fit import Fit
 
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
-NEARLY = 0.95  # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
+# of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
+NEARLY = 0.95
 NEXT_LEAVES = 0.1  # of what the best candidate leaves, that a linear step of another cause may leave of it
-PASSED_ON = 10.0  # share of what a cause explains that errors of its law leave at other joints, over that at its own, at most
+# share of what a cause explains that errors of its law leave at other joints, over that at its own, at most
+PASSED_ON = 10.0
 TOLD_AT_LEAST = 1e-9  # fall of the cost, of causes that bring none at a joint
 SPOILT = 0.3  # of the noise, left where a strong effect may have spoilt the drives, that asks for one
 MIN_EVIDENCE = 25.0  # fall of the scaled cost that a cause must bring
@@ -68,7 +70,8 @@ def left_share(baseline: Fit, current: Fit) -> float:
 
 
 def told_share(baseline: Fit, found: Round) -> float:
-    """Share of the discrepancy of the baseline that a round explains; more than 1 of one within the error of the noise."""
+    """Share of the discrepancy of the baseline that a round explains; more than 1 of one within the error of the
+    noise."""
     return found.fall / max(baseline.cost - DETECTION_EXCESS * baseline.count, 1.0)
 
 
@@ -78,7 +81,8 @@ def answers(found: Round, least: float = MIN_EVIDENCE) -> bool:
 
 
 def with_name(found: Round) -> Round:
-    """A round that a decoy has won, won by the law of the catalogue that it holds, or by one that explains nearly as much.
+    """A round that a decoy has won, won by the law of the catalogue that it holds, or by one that explains nearly as
+    much.
 
     Beside causes that are still missing what sets them apart means little: the decoy is a rival again at the end.
     """
@@ -139,24 +143,29 @@ def attribute_once(
 def leaves_much(problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]) -> bool:
     """Whether the best candidate leaves so much that a strong effect may be missing.
 
-    That is anything clearly above the noise where the drives cannot be those of the arm, or where the arm may have several steady
-    motions under the law of the best; else more than what is faint, and than errors of its law.
+    That is anything clearly above the noise where the drives cannot be those of the arm, or where the arm may have
+    several steady motions under the law of the best; else more than what is faint, and than errors of its law.
     """
     bent = bool(ranked) and "bends" in ranked[0][0].options
     return min(before.cost - before.count, left_by(ranked)) > allowed_to_stay(problem, before, bent)
 
 
 def allowed_to_stay(problem: Problem, before: Fit, bent: bool) -> float:
-    """Excess over noise that the best candidate may leave with no strong effect missing; ``bent``: by its law the arm may have
+    """Excess over noise that the best candidate may leave with no strong effect missing; ``bent``: by its law the arm
+    may have
     several steady motions."""
     spoilt = not problem.motions_alone and (bent or implausible(problem, before))
     return SPOILT * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * (before.cost - before.count))
 
 
-def next_answers(problem: Problem, before: Fit, best: Hypothesis, result: Fit, hypotheses: Sequence[Hypothesis]) -> bool:
-    """Whether a linear step of another hypothesis explains what the best candidate leaves: that is then another cause, and none strong.
+def next_answers(
+    problem: Problem, before: Fit, best: Hypothesis, result: Fit, hypotheses: Sequence[Hypothesis]
+) -> bool:
+    """Whether a linear step of another hypothesis explains what the best candidate leaves: that is then another cause,
+    and none strong.
 
-    Of two causes the first to be named leaves the second, which the next round finds; strong effects show little in linear steps.
+    Of two causes the first to be named leaves the second, which the next round finds; strong effects show little in
+    linear steps.
     """
     if "bends" in best.options or best.decoy:
         return False
@@ -168,9 +177,11 @@ def next_answers(problem: Problem, before: Fit, best: Hypothesis, result: Fit, h
 
 
 def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozenset[int]:
-    """Joints at which next to nothing is left beside what a cause has explained there, all in the noise of the model as it is.
+    """Joints at which next to nothing is left beside what a cause has explained there, all in the noise of the model as
+    it is.
 
-    Up to ``LAW_ERROR`` of it; where the errors of its law reach other joints, no more than ``PASSED_ON`` times the share at its own.
+    Up to ``LAW_ERROR`` of it; where the errors of its law reach other joints, no more than ``PASSED_ON`` times the
+    share at its own.
     """
     left = current.costs - current.counts
     out = set()
@@ -187,7 +198,8 @@ def shadows(problem: Problem, current: Fit, rounds: Sequence[Round]) -> frozense
 
 
 def settles_its_joint(problem: Problem, current: Fit, h: Hypothesis, result: Fit) -> bool:
-    """Whether a candidate leaves no more than noise of a clear discrepancy at its own joint: what is left has another cause.
+    """Whether a candidate leaves no more than noise of a clear discrepancy at its own joint: what is left has another
+    cause.
 
     Along the measured motion of the motors most effects reach the torque of their own joint alone.
     """
@@ -210,7 +222,9 @@ def beside_unclear(
     hopefuls = best_named([(h, r) for h, r in direct if not last_is_pointless(r)], FINALISTS, FINALISTS)
     same = workers.map(lambda x: refit(problem, x[1].model, found.before.weights, x[1].remainders), hopefuls)
     known = [(c.hypothesis, c.fit) for c in found.candidates]
-    new = [(h, r) for (h, _), r in zip(hopefuls, same, strict=True) if r is not None and all(h is not k for k, _ in known)]
+    new = [
+        (h, r) for (h, _), r in zip(hopefuls, same, strict=True) if r is not None and all(h is not k for k, _ in known)
+    ]
     if not new:
         return found
     before, ranked = under_noise_of_best(problem, found.before, sorted(known + new, key=lambda x: x[1].cost), workers)
@@ -223,7 +237,10 @@ def temper_of(before: Fit) -> float:
 
 
 def weighed_round(
-    before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]], scores: Sequence[Score], softly: Mapping[tuple[str, str], float]
+    before: Fit,
+    ranked: Sequence[tuple[Hypothesis, Fit]],
+    scores: Sequence[Score],
+    softly: Mapping[tuple[str, str], float],
 ) -> Round:
     """Candidates weighed by their evidence.
 

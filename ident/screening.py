@@ -35,8 +35,9 @@ class Score:
     """Best unit response of a hypothesis: fall of the cost, its degrees of freedom, a start.
 
     ``step`` (p,) is what the coordinates that are fitted already do in the same linear step, as a gear does that has
-    taken the place of a spring beside it; None where it is not known. ``near``: scores at other wave numbers of a ripple, best
-    first, that come near the best: a motion of a few turns hardly tells them, and no step of a fit leads from one to another.
+    taken the place of a spring beside it; None where it is not known. ``near``: scores at other wave numbers of a
+    ripple, best first, that come near the best: a motion of a few turns hardly tells them, and no step of a fit leads
+    from one to another.
     """
 
     hypothesis: Hypothesis
@@ -108,8 +109,8 @@ class _Stage:
 
     ``damped`` is that inverse with what is known of the coordinates beforehand, for steps.
 
-    ``residuals`` (S, K, n), ``columns`` (S, K, n, p) and ``moved`` (S, K, n, joints) per group, complex; the last is what
-    a constant unit torque in a gear does by the posture to which it moves the arm, none for motions.
+    ``residuals`` (S, K, n), ``columns`` (S, K, n, p) and ``moved`` (S, K, n, joints) per group, complex; the last is
+    what a constant unit torque in a gear does by the posture to which it moves the arm, none for motions.
     """
 
     problem: Problem
@@ -127,7 +128,9 @@ class _Stage:
     def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
         def whitened(g: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
             group, pred = problem.groups[g], predictions[g]
-            J = fit.weights.apply(g, group.observe_outputs(jacobian(problem, fit.model, group, pred, shifts=True).dense()))
+            J = fit.weights.apply(
+                g, group.observe_outputs(jacobian(problem, fit.model, group, pred, shifts=True).dense())
+            )
             moved = None
             if group.window is None:
                 moved = fit.weights.apply(g, group.observe_outputs(moved_by_gears(pred)))
@@ -212,14 +215,16 @@ def other_waves(best: Score, others: Sequence[Score]) -> tuple[Score, ...]:
     """Scores of a ripple, best first, at wave numbers that none before has, and that come near the best."""
     kept = [best]
     for s in others:
-        if s.start is not None and s.gain >= NEAR_WAVE * best.gain and all(abs(s.shape[0] / k.shape[0] - 1.0) > SAME_WAVE for k in kept):
+        if (
+            s.start is not None
+            and s.gain >= NEAR_WAVE * best.gain
+            and all(abs(s.shape[0] / k.shape[0] - 1.0) > SAME_WAVE for k in kept)
+        ):
             kept.append(s)
     return tuple(kept[1 : 1 + MOST_WAVES])
 
 
-def _score(
-    stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, shape: tuple[float, ...]
-) -> Score | None:
+def _score(stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, shape: tuple[float, ...]) -> Score | None:
     total = None
     start: Callable[[np.ndarray], np.ndarray | None] = h.options.get("start", lambda c: None)
     for g, (group, pred) in enumerate(zip(stage.problem.groups, stage.predictions, strict=True)):
@@ -252,14 +257,17 @@ def _score(
 
 
 def _along_motion(stage: _Stage, g: int, channel: str, joint: int, signals: np.ndarray) -> np.ndarray:
-    """Outputs (S, L, n + M, m) of a motion by signals (S, L, m) of a channel at a joint; those of the position move gravity and inertia."""
+    """Outputs (S, L, n + M, m) of a motion by signals (S, L, m) of a channel at a joint; those of the position move
+    gravity and inertia."""
     group, pred, problem = stage.problem.groups[g], stage.predictions[g], stage.problem
     if channel != "position":
         return _gain(pred, channel, joint)[None, :, :, None] * signals[:, :, None]
 
     def outputs(Q: np.ndarray) -> np.ndarray:
         of = replace(group, Q=Q)
-        return predict(stage.fit.model, of, problem.sampling, W=pred.solution.W, steps=1, torques=pred.solution.torques).outputs(of)
+        return predict(
+            stage.fit.model, of, problem.sampling, W=pred.solution.W, steps=1, torques=pred.solution.torques
+        ).outputs(of)
 
     before, out = outputs(group.Q), []
     for X in np.moveaxis(signals, -1, 0):
@@ -303,7 +311,11 @@ def _line_sums(parts: Sequence[tuple[_Field, np.ndarray]]) -> _Sums:
 
 def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | None:
     if "hinge" in h.options:
-        return None if c[0] < 0.05 else h.options["hinge"](problem.structure, problem.groups[0], *shape, softer=float(np.clip(c[0], 0.2, 3.0)))
+        return (
+            None
+            if c[0] < 0.05
+            else h.options["hinge"](problem.structure, problem.groups[0], *shape, softer=float(np.clip(c[0], 0.2, 3.0)))
+        )
     p = start(c)
     return None if p is None or not np.all(np.isfinite(p)) else np.asarray(p, float)
 
@@ -324,7 +336,8 @@ def _gain(pred: Prediction, channel: str, joint: int) -> np.ndarray:
 
 
 def _share_of_gears(pred: Prediction, channel: str, joint: int) -> np.ndarray:
-    """(joints,) constant torques in the gears that move the arm as the mean of a signal of a channel at a joint does."""
+    """(joints,) constant torques in the gears that move the arm as the mean of a signal of a channel at a joint
+    does."""
     each = np.eye(pred.structure.n)[joint]
     if channel == "spring":
         return each

@@ -1,4 +1,5 @@
-"""Candidates for a cause: screened hypotheses refitted with the baseline, from where the missing cause lets them be found.
+"""Candidates for a cause: screened hypotheses refitted with the baseline, from where the missing cause lets them be
+found.
 
 A strong cause moves the drives to where no single step leads back. Candidates are therefore sought from the model as it
 stands, from one fitted under softened weights, and strong laws from the starting guesses of the drives.
@@ -182,12 +183,17 @@ def explore(
         return min((r for r in fits if r is not None), key=lambda r: r.cost, default=None)
 
     def started_at(score: Score) -> Fit | None:
-        # A start that has lost the data was a step that is not linear, and a gear that hits one end of its dead band after
-        # the other takes minutes to fit. A hinge that stands anywhere begins off them, and what answers best is tried from anywhere.
+        # A start that has lost the data was a step that is not linear, and a gear that hits one end of its dead band
+        # after the other takes minutes to fit. A hinge that stands anywhere begins off them, and what answers best is
+        # tried from anywhere.
         anywhere = "hinge" in score.hypothesis.options or score.gain >= scores[0].gain
         most = np.inf if anywhere else STRONG * (stage.count if stage.chi2_per_dof <= FAINT else stage.cost)
         model, cost = begin(problem, stage, score)
-        result = refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most) if anywhere or cost <= most else None
+        result = (
+            refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most)
+            if anywhere or cost <= most
+            else None
+        )
         if result is not None and turned(result.model.effects[-1]) is not result.model.effects[-1]:
             return refit(problem, result.model, stage.weights, stage.remainders, FIRST_STEPS) or result
         return result
@@ -204,11 +210,13 @@ def explore(
     found = begun(chosen)
     if not workers.late:
         found += begun(other_bodies(found, chosen, scores))
-    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law that is solved as a
-    # loop or along the record leaves that much itself.
+    # Where little is left gears have taken up a missing hinge, and another hypothesis most of the rest; a law that is
+    # solved as a loop or along the record leaves that much itself.
     seen = np.setdiff1d(np.arange(len(stage.counts)), list(quiet))
     allowed = (DETECTION_EXCESS - 1.0) * np.sum(stage.counts[seen])
-    unclear = stage.chi2_per_dof <= FAINT and not any(map(has_loop, stage.model.effects)) and left_by(found, seen) > allowed
+    unclear = (
+        stage.chi2_per_dof <= FAINT and not any(map(has_loop, stage.model.effects)) and left_by(found, seen) > allowed
+    )
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
         found += begun(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
@@ -220,10 +228,11 @@ def explore(
 
 
 def begin(problem: Problem, stage: Fit, score: Score) -> tuple[Model, float]:
-    """The model with a screened hypothesis, what is fitted already as it is or after the step that goes with it: whichever costs less; and its cost.
+    """The model with a screened hypothesis, what is fitted already as it is or after the step that goes with it:
+    whichever costs less; and its cost.
 
-    Where drives have taken the place of a cause, as a stiffer gear takes that of one that yields late, the cause beside them
-    as they are is far from the data.
+    Where drives have taken the place of a cause, as a stiffer gear takes that of one that yields late, the cause beside
+    them as they are is far from the data.
     """
     models = [stage.model] if score.step is None else [stage.model, stepped(problem, stage.model, score.step)]
     models = [replace(m, effects=extended_by(m.effects, score)) for m in models]
@@ -245,8 +254,8 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
     """Candidates that a few steps have not shown to be far behind the best.
 
     The one that screening puts first is kept: where the drives have taken its place, as a stiffer gear takes that of
-    one that yields late, the first steps lead uphill. So is the special case of a law that is kept, which does less by what the
-    law has beyond it: where that is noise, it is the special case that is right.
+    one that yields late, the first steps lead uphill. So is the special case of a law that is kept, which does less by
+    what the law has beyond it: where that is noise, it is the special case that is right.
 
     Args:
         found: in the order of their scores.
@@ -263,7 +272,8 @@ def hopeful(found: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, F
 
 
 def best_named(ranked: Sequence[tuple[Hypothesis, T]], count: int, decoys: int) -> list[tuple[Hypothesis, T]]:
-    """The first ``count`` of the catalogue, of a ranking, and the first ``decoys`` before the last of them: these take no place of a named one."""
+    """The first ``count`` of the catalogue, of a ranking, and the first ``decoys`` before the last of them: these take
+    no place of a named one."""
     decoy = np.array([h.decoy for h, _ in ranked], bool)
     before = np.cumsum(~decoy) - ~decoy  # named ones
     kept = (before < count) & (~decoy | (np.cumsum(decoy) <= decoys))
@@ -298,8 +308,11 @@ def _side(score: Score) -> tuple[tuple[str, str], bool]:
     return score.hypothesis.key, score.hypothesis.options["before"]
 
 
-def other_bodies(found: Sequence[tuple[Hypothesis, Fit]], tried: Sequence[Score], scores: Sequence[Score]) -> list[Score]:
-    """Bodies not yet ``tried`` whose inertia a linear step puts near the best of them, where that of some body answers best.
+def other_bodies(
+    found: Sequence[tuple[Hypothesis, Fit]], tried: Sequence[Score], scores: Sequence[Score]
+) -> list[Score]:
+    """Bodies not yet ``tried`` whose inertia a linear step puts near the best of them, where that of some body answers
+    best.
 
     What one link weighs more another does nearly as well: linear steps tell hardly which of them it is.
     """
@@ -318,6 +331,8 @@ def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Seq
     middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).highest_line
     hinges = [s for s in scores if "hinge" in s.hypothesis.options]
     return [
-        replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO), step=None)
+        replace(
+            s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO), step=None
+        )
         for s in hinges
     ]

@@ -105,7 +105,9 @@ def _channel(columns: dict[str, np.ndarray], channel: str, n: int, path: Path) -
     wanted = [f"{channel}_{j + 1}" for j in range(n)]
     surplus = sorted(own - set(wanted))
     if surplus:
-        raise DataError(f"column {surplus[0]}", str(path), "a column beyond the joints", f"{channel}_1 to {channel}_{n}")
+        raise DataError(
+            f"column {surplus[0]}", str(path), "a column beyond the joints", f"{channel}_1 to {channel}_{n}"
+        )
     if not own and channel not in REQUIRED:
         return None
     missing = [c for c in wanted if c not in own]
@@ -128,7 +130,15 @@ def _check_time(t: np.ndarray, rate: float, path: Path) -> None:
     if len(bad):
         k = int(bad[0])
         raise DataError(
-            "column t", str(path), f"a step of {step[k]:.6g} s at sample {k} ({len(bad)} such)", f"uniform steps of {1 / rate:.6g} s"
+            "column t",
+            str(path),
+            f"a step of {step[k]:.6g} s at sample {k} ({len(bad)} such)",
+            f"uniform steps of {1 / rate:.6g} s",
         )
     if abs((t[-1] - t[0]) * rate / (len(t) - 1) - 1.0) > 1e-3:
-        raise DataError("column t", str(path), f"a mean rate of {(len(t) - 1) / (t[-1] - t[0]):.6g} Hz", f"sample_rate = {rate:g} Hz")
+        raise DataError(
+            "column t",
+            str(path),
+            f"a mean rate of {(len(t) - 1) / (t[-1] - t[0]):.6g} Hz",
+            f"sample_rate = {rate:g} Hz",
+        )

@@ -1,4 +1,5 @@
-"""Channels of one recording that come late after another, by what rigid bodies, friction and gears say they should be."""
+"""Channels of one recording that come late after another, by what rigid bodies, friction and gears say they should
+be."""
 
 from __future__ import annotations
 
@@ -51,9 +52,9 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
     All joints together, as one channel of torques is sampled at one time: torque is a linear combination
     of the rigid-body regressor, of motor inertia and of friction. Samples of slow joints, where friction
     has memory, are left out. The deviation is that of a jackknife over ``BLOCKS`` stretches of time. A shift that
-    leaves most of what was unexplained, and more than noise, stands for something else, such as a gear with lost motion,
-    and one that is gone without one of the joints is no skew of the channels, but an effect of that joint.
-    It is a cross-correlation in which inertia, gravity and friction have their place.
+    leaves most of what was unexplained, and more than noise, stands for something else, such as a gear with lost
+    motion, and one that is gone without one of the joints is no skew of the channels, but an effect of that joint. It
+    is a cross-correlation in which inertia, gravity and friction have their place.
     """
     rate, n = dataset.sample_rate, dataset.n
     q, tau, v, a = _band(s, rate)
@@ -96,7 +97,11 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
     at = np.tile(np.arange(n), len(pick))[rows]
     for j in range(n) if skew.sure and n > 1 else ():
         others = at != j
-        without = late - _shift(A[rows][others], slope[others], y.ravel()[rows][others]) if others.sum() > A.shape[1] else late
+        without = (
+            late - _shift(A[rows][others], slope[others], y.ravel()[rows][others])
+            if others.sum() > A.shape[1]
+            else late
+        )
         if not abs(without - late) < ONE_JOINT * abs(late):
             return UNKNOWN
     return skew
@@ -109,10 +114,14 @@ def _torque_columns(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.nd
     full = np.zeros((3, N, model.nv))
     for k, x in enumerate((q, v, a)):
         full[k][:, d] = x
-    rigid = np.array([pin.computeJointTorqueRegressor(model, data, *full[:, i]).reshape(model.nv, -1)[d].copy() for i in range(N)])
+    rigid = np.array(
+        [pin.computeJointTorqueRegressor(model, data, *full[:, i]).reshape(model.nv, -1)[d].copy() for i in range(N)]
+    )
     own = np.zeros((N, n, 5 * n))
     for j in range(n):
-        own[:, j, 5 * j : 5 * j + 5] = np.stack([a[:, j], v[:, j], v[:, j] * np.abs(v[:, j]), turns[:, j], np.ones(N)], axis=1)
+        own[:, j, 5 * j : 5 * j + 5] = np.stack(
+            [a[:, j], v[:, j], v[:, j] * np.abs(v[:, j]), turns[:, j], np.ones(N)], axis=1
+        )
     return np.concatenate([rigid, own], axis=2)
 
 
@@ -191,7 +200,9 @@ def skew_warnings(s: Segment, dataset: Dataset) -> list[str]:
     if s.kind != "trajectory" or len(s.t) < 4 * rate * SETTLED + 100:
         return []
     named = [("torque", "the positions", torque_skew(s, dataset), -held)]
-    named += [(f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k, 0.0) for j, k in enumerate(link_skew(s, dataset))]
+    named += [
+        (f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k, 0.0) for j, k in enumerate(link_skew(s, dataset))
+    ]
     return [
         f"{what} comes {abs(k.late) * 1e3:.2g} ms {'after' if k.late > 0 else 'before'} {other} (± {k.std * 1e3:.1g} ms): {_reason(what, k.late, usual, rate)}"
         for what, other, k, usual in named

@@ -1,7 +1,7 @@
 """Motors that dry friction holds: where, and what is left of noise and of derivatives there.
 
-The friction of a motor at rest is what the drive asks of it. As long as that is below its size nothing of the torque is left:
-neither an error of the model nor noise, and no parameter changes that.
+The friction of a motor at rest is what the drive asks of it. As long as that is below its size nothing of the torque is
+left: neither an error of the model nor noise, and no parameter changes that.
 """
 
 from __future__ import annotations
@@ -31,14 +31,18 @@ def held(pred: Prediction, group: Group) -> np.ndarray | None:
         seen = beside(pred.model.effects, effect, motion)
         less = np.zeros(pred.U.shape)
         less[:, 0, j] = PROBE * np.abs(pred.U[..., j]).max()
-        # Where the drive asks for a little less the friction of a motor that is held gives less; what is beyond its size does not.
-        answers = effect.hypothesis.law(effect.p, seen, j, k) - effect.hypothesis.law(effect.p, replace(seen, beside=seen.beside + less), j, k)
+        # Where the drive asks for a little less the friction of a motor that is held gives less; what is beyond its
+        # size does not.
+        answers = effect.hypothesis.law(effect.p, seen, j, k) - effect.hypothesis.law(
+            effect.p, replace(seen, beside=seen.beside + less), j, k
+        )
         out[..., j] |= group.rest[..., j] & (answers > 0.5 * less[:, :1, j])
     return out
 
 
 def held_share(pred: Prediction, group: Group) -> np.ndarray | None:
-    """(T, n, n) share of the noise of two joints, by the time between them, that dry friction at rest leaves; None where it holds no motor.
+    """(T, n, n) share of the noise of two joints, by the time between them, that dry friction at rest leaves; None
+    where it holds no motor.
 
     A motor that is held takes from its friction whatever the drive asks, noise and all: there next to nothing is left.
     """
@@ -50,7 +54,8 @@ def held_share(pred: Prediction, group: Group) -> np.ndarray | None:
 
 
 def as_held(S: np.ndarray, share: np.ndarray | None) -> np.ndarray:
-    """Covariance (K, n, n) of lines of stationary noise, of which time-varying shares are left (``held_share``): those of other lines mix in."""
+    """Covariance (K, n, n) of lines of stationary noise, of which time-varying shares are left (``held_share``): those
+    of other lines mix in."""
     if share is None:
         return S
     K, T = len(S), len(share)

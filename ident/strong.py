@@ -1,4 +1,5 @@
-"""Strong effects, sought from the starting guesses of the drives, and laws of the gear along the record against those that are predicted whole."""
+"""Strong effects, sought from the starting guesses of the drives, and laws of the gear along the record against those
+that are predicted whole."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weig
 RECOVERIES = 2  # at most, of gears gone astray beside one
 RENEWALS = 3  # at most, of the noise of a law along the record under which its size is found
 STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit ends: the winner is fitted to the end
-OTHER_MOTION = 10.0  # chi2 of a loop over that along the record, each in its own noise, from which it is in another motion
+# chi2 of a loop over that along the record, each in its own noise, from which it is in another motion
+OTHER_MOTION = 10.0
 CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 
@@ -53,8 +55,8 @@ def beside_strong(
     them the noise that the model passes on: a joint that sticks looks like one without motor inertia.
     Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
     gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
-    as loops where these do as well. Those at the joint of the best candidate come first, and last where its own law leaves
-    noise alone.
+    as loops where these do as well. Those at the joint of the best candidate come first, and last where its own law
+    leaves noise alone.
 
     Args:
         quiet: joints at which none is sought.
@@ -64,7 +66,9 @@ def beside_strong(
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                last = recovered(problem, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP))
+                last = recovered(
+                    problem, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP)
+                )
                 return either_turn(problem, last, last.model.effects[-1])
         except NOT_COMPUTED:
             return None
@@ -72,7 +76,9 @@ def beside_strong(
     top = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
     likely, key = (top.joint, top.key) if top else (-1, None)
     chosen = strong_effects(problem, before, scores, likely, quiet)
-    chosen = [replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen]
+    chosen = [
+        replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen
+    ]
     pairs: list[tuple[Hypothesis, Fit]] = []
     for here in (True, False):
         some = [s for s in chosen if (s.hypothesis.joint == likely) == here]
@@ -81,14 +87,19 @@ def beside_strong(
         if any(h.key == key and settled(r) for h, r in pairs):
             break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
-    along = sorted((x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1], [x[0].joint])), key=lambda x: x[1].cost)
+    along = sorted(
+        (x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1], [x[0].joint])),
+        key=lambda x: x[1].cost,
+    )
     again = workers.map(lambda x: under_its_noise(problem, x[1]), along[:FINALISTS])
     along = [(h, r) for (h, _), r in zip(along[:FINALISTS], again, strict=True)]
     told = workers.map(lambda x: simulated(problem, *x), along)
     right = [r for (_, r), (h, _) in zip(along, told, strict=True) if not is_along_record(h)]
     strong += [(h, r) for h, r in told if not (is_along_record(h) and outdone_along(problem, h.joint, r, right))]
     if any(is_along_record(h) for h, _ in strong):
-        own = workers.map(partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)])
+        own = workers.map(
+            partial(under_own_noise, problem), [r for h, r in (*strong, *ranked) if not is_along_record(h)]
+        )
         whole = [r for r in own if r is not None]
         strong = [(h, r) for h, r in strong if not (is_along_record(h) and matched(problem, h.joint, r, whole))]
     if not left_by(strong) < left_by(ranked):
@@ -101,7 +112,8 @@ def beside_strong(
 
 
 def under_its_noise(problem: Problem, result: Fit) -> Fit:
-    """A fit along the record, of a law at joints where much is left, under the noise that it sees where it ends, once and again.
+    """A fit along the record, of a law at joints where much is left, under the noise that it sees where it ends, once
+    and again.
 
     That noise is of the size of the law, and the size is found under it.
     """
@@ -117,7 +129,8 @@ def under_its_noise(problem: Problem, result: Fit) -> Fit:
 
 
 def recovered(problem: Problem, result: Fit) -> Fit:
-    """A fit of a strong effect, gears that have gone astray on the way begun again from their guesses as long as that does better.
+    """A fit of a strong effect, gears that have gone astray on the way begun again from their guesses as long as that
+    does better.
 
     Where an effect is not yet of its size they take up what it leaves, and do not come back.
     """
@@ -126,7 +139,9 @@ def recovered(problem: Problem, result: Fit) -> Fit:
         if result.chi2_per_dof <= DETECTION_EXCESS or not np.any(lost):
             return result
         model = replace(result.model, par=begun_again(problem, result.model.par, lost))
-        other = anneal(problem, model, ladder=ANNEALING[-2:], iterations=STRONG_STEPS, gap=STRONG_GAP, remainders=result.remainders)
+        other = anneal(
+            problem, model, ladder=ANNEALING[-2:], iterations=STRONG_STEPS, gap=STRONG_GAP, remainders=result.remainders
+        )
         if not other.cost < CLEARLY_BETTER * result.cost:
             return result
         result = other
@@ -138,7 +153,8 @@ def strong_effects(
 ) -> list[Score]:
     """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
 
-    None at joints that are ``quiet``: where most of it is at one of these, the next joint takes its place if it has ``SPILT`` of that.
+    None at joints that are ``quiet``: where most of it is at one of these, the next joint takes its place if it has
+    ``SPILT`` of that.
 
     A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
     of the time hardly shows its inertia: the linear step of a score says little about either. Motions below the
@@ -161,9 +177,10 @@ def strong_effects(
 def matched(problem: Problem, joint: int, along: Fit, whole: Sequence[Fit]) -> bool:
     """Whether a model that is predicted whole leaves noise at a joint, or about what one along the record leaves.
 
-    Noise along the record is taken large for all joints, which flatters the model that it is taken for, most of all where
-    another cause is missing. Both are seen in that noise, each less what its own noise is in those units; not where the whole one is
-    far off in its own: much is within noise that is large enough, and its law along the record is compared in ``outdone_along``.
+    Noise along the record is taken large for all joints, which flatters the model that it is taken for, most of all
+    where another cause is missing. Both are seen in that noise, each less what its own noise is in those units; not
+    where the whole one is far off in its own: much is within noise that is large enough, and its law along the record
+    is compared in ``outdone_along``.
 
     Args:
         whole: fits of models that are predicted whole, each under the noise that it sees itself.
@@ -202,23 +219,29 @@ def excess_under(problem: Problem, joint: int, result: Fit, weights: Weights) ->
 def outdone_along(problem: Problem, joint: int, along: Fit, right: Sequence[Fit]) -> bool:
     """Whether a model along the record leaves no less at a joint than one along it whose law is right as a loop too.
 
-    What the record tells both of them is no merit of a law that is right along it alone. Both are seen in the noise of the
-    former, each less what its own noise is in those units, as in ``matched``. One that leaves clearly more in its own noise
-    is not right: a hardening gear that rattles makes so much of the noise that anything is within it.
+    What the record tells both of them is no merit of a law that is right along it alone. Both are seen in the noise of
+    the former, each less what its own noise is in those units, as in ``matched``. One that leaves clearly more in its
+    own noise is not right: a hardening gear that rattles makes so much of the noise that anything is within it.
 
     Args:
         right: fits along the record of models with such laws.
     """
     left = left_along(joint, along)
-    others = [r for r in right if r.model.effects[-1].hypothesis.joint == joint and r.costs[joint] <= along.costs[joint] / CLEARLY_BETTER]
+    others = [
+        r
+        for r in right
+        if r.model.effects[-1].hypothesis.joint == joint and r.costs[joint] <= along.costs[joint] / CLEARLY_BETTER
+    ]
     return any(excess_under(problem, joint, r, along.weights) <= left for r in others)
 
 
 def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis, Fit]:
-    """A law of the gear that was fitted along the record, as the loop that it is where that leaves noise, or no more than along the record.
+    """A law of the gear that was fitted along the record, as the loop that it is where that leaves noise, or no more
+    than along the record.
 
-    It does not where the arm rattles, and has several steady motions: then the loop is far off in its own noise, however large that
-    along the record. Both are seen in the latter, each less what its own noise is in those units, as in ``matched``.
+    It does not where the arm rattles, and has several steady motions: then the loop is far off in its own noise,
+    however large that along the record. Both are seen in the latter, each less what its own noise is in those units, as
+    in ``matched``.
     """
     loop = as_loop(h)
     *others, last = result.model.effects

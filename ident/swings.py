@@ -1,9 +1,9 @@
 """Records less what the arm swings by itself from period to period.
 
-A link that is hardly damped goes on swinging for many periods, of a transient or of noise in the loop. What a period ends elsewhere
-than it began stands in its spectrum beside the steady state: over a whole period ``x''`` has the lines ``s^2 X`` and, of the ends,
-``(dv + s dx) / T`` (Pintelon and Schoukens 2012, ch. 6). At a resonance that is far above the noise, alternates from period to
-period, and so looks like noise that is many times what is left in their mean.
+A link that is hardly damped goes on swinging for many periods, of a transient or of noise in the loop. What a period
+ends elsewhere than it began stands in its spectrum beside the steady state: over a whole period ``x''`` has the lines
+``s^2 X`` and, of the ends, ``(dv + s dx) / T`` (Pintelon and Schoukens 2012, ch. 6). At a resonance that is far above
+the noise, alternates from period to period, and so looks like noise that is many times what is left in their mean.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ from ident.torque_fit import Fit
 def without_swings(problem: Problem, result: Fit) -> Problem:
     """The problem with periodic records less what the ends of their periods leave in the residual of a fit.
 
-    Of each period what the ends can do is taken off as far as it explains the residual: two real numbers for each coordinate of the
-    links and each motor, of the many that are compared.
+    Of each period what the ends can do is taken off as far as it explains the residual: two real numbers for each
+    coordinate of the links and each motor, of the many that are compared.
     """
     preds = predictions(problem, result.model, result.remainders)
-    groups = tuple(_steadied(problem, g, p) if g.window is None else g for g, p in zip(problem.groups, preds, strict=True))
+    groups = tuple(
+        _steadied(problem, g, p) if g.window is None else g for g, p in zip(problem.groups, preds, strict=True)
+    )
     return replace(problem, groups=groups)
 
 

@@ -1,8 +1,8 @@
 """Whether the torques of a recording are those that its motion asks for: signs, sizes, order of columns, units of time.
 
-The torque that the bodies of the description, the motors and gravity need along the measured motion is compared with the
-one recorded, joint by joint and across joints, friction and an offset of each joint left free. Descriptions are wrong by some
-ten per cent and drives by a factor of two, so only what is far outside is said.
+The torque that the bodies of the description, the motors and gravity need along the measured motion is compared with
+the one recorded, joint by joint and across joints, friction and an offset of each joint left free. Descriptions are
+wrong by some ten per cent and drives by a factor of two, so only what is far outside is said.
 """
 
 from __future__ import annotations
@@ -107,19 +107,27 @@ def contradictions(found: Match, joints: tuple[str, ...]) -> dict[tuple[int, str
     said: set[int] = set()
     for i in range(len(joints)):
         for k in range(i):
-            crossed = min(C[i, k], C[k, i]) > ALIKE and all(1 - c**2 < BETTER * (1 - o**2) for c, o in ((C[i, k], own[i]), (C[k, i], own[k])))
+            crossed = min(C[i, k], C[k, i]) > ALIKE and all(
+                1 - c**2 < BETTER * (1 - o**2) for c, o in ((C[i, k], own[i]), (C[k, i], own[k]))
+            )
             if crossed and not said & {i, k}:
                 said |= {i, k}
-                out[k, "swapped"] = f"{named[k]} follows what joint {i + 1} needs and tau_{i + 1} what joint {k + 1} needs: columns swapped?"
+                out[k, "swapped"] = (
+                    f"{named[k]} follows what joint {i + 1} needs and tau_{i + 1} what joint {k + 1} needs: columns swapped?"
+                )
     for j in range(len(joints)):
         if j in said or abs(own[j]) < ALIKE:
             continue
         if own[j] < 0:
             out[j, "sign"] = f"{named[j]} runs against what bodies and motor need, {slope[j]:.3g} times it: wrong sign?"
         elif not 1 / FAR < slope[j] < FAR:
-            out[j, "size"] = f"{named[j]} is {slope[j]:.3g} times what bodies and motor need: wrong unit, torque constant or side of the gear?"
+            out[j, "size"] = (
+                f"{named[j]} is {slope[j]:.3g} times what bodies and motor need: wrong unit, torque constant or side of the gear?"
+            )
     if not out and np.all(np.abs(own) < NOTHING) and np.all(found.size > LARGE[0]):
-        out[0, "noise"] = f"the torques have nothing to do with what the motion needs (correlation {np.abs(own).max():.2g} at most): noise, or of another run?"
+        out[0, "noise"] = (
+            f"the torques have nothing to do with what the motion needs (correlation {np.abs(own).max():.2g} at most): noise, or of another run?"
+        )
     return out
 
 
@@ -128,7 +136,9 @@ def _doubts(found: Match) -> list[str]:
     out, slope, own = [], found.slope, np.diag(found.correlation)
     sure = slope[own > ALIKE]
     if len(sure) >= 3 and not 1 / ALL < np.median(sure) < ALL:
-        out.append(f"torques are about {np.median(sure):.2g} times what bodies and motors need: wrong unit, or sample rate?")
+        out.append(
+            f"torques are about {np.median(sure):.2g} times what bodies and motors need: wrong unit, or sample rate?"
+        )
     strange = (own < APART) & (found.size > LARGE[0])
     against = (own < AGAINST[0]) & (found.size > AGAINST[1])
     if np.sum(strange) > 1 or np.any(strange & (found.size > LARGE[1])) or np.any(against):

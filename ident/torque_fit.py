@@ -46,7 +46,8 @@ RIDGE = 1e-12  # relative, of a covariance
 LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
 SHORTER = 64.0  # factor on the damping of steps then
 SLIGHT = 2.0  # fall of the cost that tells nothing
-FORETOLD = 0.1  # error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
+# error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
+FORETOLD = 0.1
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,8 @@ class Fit:
         costs: (n,) whitened sum of squares by joint, prior excluded; of noise as much as the model of the weights has
             (``fair_costs``).
         counts: (n,) real data that entered.
-        information: (p, p) of the data on the fitted coordinates, prior excluded; their normal matrix where the noise of the
-            position counts for nothing.
+        information: (p, p) of the data on the fitted coordinates, prior excluded; their normal matrix where the noise
+            of the position counts for nothing.
         names: of the fitted coordinates.
         remainders: geometric remainder per group, for warm starts.
         weights: under which it was made.
@@ -127,8 +128,8 @@ def anneal(
 ) -> Fit:
     """Fits under less and less error added to the noise (``ladder``), each from where the last one ended.
 
-    With as much error as ``HELD`` the drives are held near their starting guesses: there the data say little, and a gear
-    that once has lost its spring does not find it again.
+    With as much error as ``HELD`` the drives are held near their starting guesses: there the data say little, and a
+    gear that once has lost its spring does not find it again.
     """
     stages: list[Fit] = []
     for i, rho in enumerate(ladder):
@@ -141,7 +142,9 @@ def anneal(
                 iterations=iterations,
                 gap=gap,
                 remainders=stages[-1].remainders if stages else remainders,
-                progress=None if progress is None else lambda text, i=i: progress(f"{text}, stage {i + 1}/{len(ladder)}"),
+                progress=None
+                if progress is None
+                else lambda text, i=i: progress(f"{text}, stage {i + 1}/{len(ladder)}"),
             )
         )
     return replace(stages[-1], softer=tuple(stages[:-1]))
@@ -174,8 +177,9 @@ def fit(
         weights: those to fit under; of the start where None.
         remainders: geometric remainders to start from.
         most: cost of the start above which there is no fit.
-        exact: beside laws of the gears the last steps, and the information, are by exact derivatives (``jacobian``), which
-            take several times as long. Beside others, and in motions, which hardly show springs, these add nothing.
+        exact: beside laws of the gears the last steps, and the information, are by exact derivatives (``jacobian``),
+            which take several times as long. Beside others, and in motions, which hardly show springs, these add
+            nothing.
 
     Raises:
         ArithmeticError: where the start costs more.
@@ -195,12 +199,13 @@ def fit(
     if np.isfinite(most) and not cost <= most:
         raise FloatingPointError(f"a start that costs {cost:.3g}, more than {most:.3g}")
     settled = model, preds, Ws, cost
-    share: float | None = None if has_scatter(problem, model) else 0.0  # of what noise adds to the cost, that is taken off
+    # of what noise adds to the cost, that is taken off
+    share: float | None = None if has_scatter(problem, model) else 0.0
     if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
-    # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a new one, as
-    # softer gears do along a motion.
+    # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a
+    # new one, as softer gears do along a motion.
     anew = problem.motions_alone or shifts_posture(model) or any(moves_geometry(e, False) for e in model.effects)
     moves, drift = moves_links(model), np.zeros(len(x))
     damping = 1e-3

@@ -35,8 +35,10 @@ SHORT = 0.25  # by which the gap closed on held-out data may fall short of what 
 FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band for its name to be trusted
 SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
 HARMONIC = 0.1  # the same of a ripple at a multiple of the periods of another one
-HALF_TRUSTED = 0.1  # share of the discrepancy left, a third of its amplitude, at which a name is as likely wrong as right
-DENIED_SHARE = 0.25  # of the fall of the cost that a faint cause foretells on held-out data, below which it does not come
+# share of the discrepancy left, a third of its amplitude, at which a name is as likely wrong as right
+HALF_TRUSTED = 0.1
+# of the fall of the cost that a faint cause foretells on held-out data, below which it does not come
+DENIED_SHARE = 0.25
 CHANCE = 3.0  # standard deviations of that fall, within which it may be short by chance
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
@@ -54,7 +56,8 @@ def _excess(result: Fit, level: float) -> np.ndarray:
 def left_of(h: Hypothesis, result: Attribution) -> float:
     """Share of the discrepancy that is left where an effect sits, 0 to 1: there no other cause hides behind it.
 
-    Where all joints together leave no more than noise, that of a single one may be known as badly as ``JOINT_EXCESS`` says.
+    Where all joints together leave no more than noise, that of a single one may be known as badly as ``JOINT_EXCESS``
+    says.
     """
     level = DETECTION_EXCESS if result.final.chi2_per_dof > DETECTION_EXCESS else JOINT_EXCESS
     before = _at(h, _excess(result.baseline, 1.0))
@@ -96,9 +99,9 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
 def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
     """Whether held-out periodic data deny a cause that was named for less than the noise as a whole shows.
 
-    A law of as many parameters as there are postures describes in these whatever another cause leaves. In a further posture
-    a law that is right lowers the cost by what it changes there in units of the noise, ``E``, with a standard deviation of
-    ``2 sqrt(E)``; one that is wrong need not. Where it changes little these data say nothing.
+    A law of as many parameters as there are postures describes in these whatever another cause leaves. In a further
+    posture a law that is right lowers the cost by what it changes there in units of the noise, ``E``, with a standard
+    deviation of ``2 sqrt(E)``; one that is wrong need not. Where it changes little these data say nothing.
 
     Args:
         groups: held-out data.
@@ -109,7 +112,9 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
         return False
     there = replace(problem, groups=periodic)
     try:
-        before, after = (predictions(there, fit.model, [None] * len(periodic), None) for fit in (found.before, winner.fit))
+        before, after = (
+            predictions(there, fit.model, [None] * len(periodic), None) for fit in (found.before, winner.fit)
+        )
         weights = make_weights(there, after, 0.0)
     except NOT_COMPUTED:
         return False
@@ -124,8 +129,9 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
 def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
     """Whether the data tell the size of what makes an effect the one that it is named, to about a factor of ``e``.
 
-    Where each parameter has a value at which the effect is none, all of them together must be further from there than chance
-    brings them (Wald 1943): a cause that has explained much while others were missing may be nothing beside these.
+    Where each parameter has a value at which the effect is none, all of them together must be further from there than
+    chance brings them (Wald 1943): a cause that has explained much while others were missing may be nothing beside
+    these.
     """
     h = effect.hypothesis
     at = [final.names.index(h.coordinate(q.name)) for q in h.parameters]

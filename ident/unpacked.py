@@ -1,4 +1,5 @@
-"""What a packed log would take in memory, looked up before it is unpacked: recordings pack ten times, bombs thousands."""
+"""What a packed log would take in memory, looked up before it is unpacked: recordings pack ten times, bombs
+thousands."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from robot_assets.errors import DataError
 
 FREE = 2**28  # bytes that every log may take
 PACKED = 100  # times the size of the file, that a longer one may take
-PIECE, FED = 2**20, 2**16  # bytes unpacked at a time to count them, and given at a time: what is left of these is copied
+# bytes unpacked at a time to count them, and given at a time: what is left of these is copied
+PIECE, FED = 2**20, 2**16
 TAG, COMPRESSED = 8, 15  # bytes of the tag of an element; type of one that is packed (MAT-File Format, 1-9)
 CELLS = (1, 2, 3)  # classes of arrays of arrays: cells, structures, objects (1-16)
 
@@ -31,7 +33,10 @@ def check_size(path: Path, size: int) -> None:
 def check_zip(path: Path, wanted: set[str] | None) -> None:
     """The arrays of an NPZ file, by the directory of the archive; None wants them all."""
     with zipfile.ZipFile(path) as file:
-        check_size(path, sum(i.file_size for i in file.infolist() if wanted is None or i.filename.removesuffix(".npy") in wanted))
+        check_size(
+            path,
+            sum(i.file_size for i in file.infolist() if wanted is None or i.filename.removesuffix(".npy") in wanted),
+        )
 
 
 def check_matlab(path: Path) -> None:

@@ -42,8 +42,8 @@ class Cause:
     """A named effect at a place ("flange" and "base" are places too).
 
     ``channel``: "q" or "q_link" for effects of a position channel, else None. ``joints``: both joints of an effect
-    between two, the turning one, which is ``joint``, first; else none. ``with_load``: of a body, whether the loads that the
-    robot names on it are part of it.
+    between two, the turning one, which is ``joint``, first; else none. ``with_load``: of a body, whether the loads that
+    the robot names on it are part of it.
     """
 
     effect: str
@@ -109,7 +109,9 @@ class Gain:
         """Rms error over all joints, before and after; of ``joints`` where single ones are not known."""
         if not self.by_joint:
             return self.before, self.after
-        return tuple(float(np.sqrt(np.mean([getattr(g, x) ** 2 for g in self.by_joint.values()]))) for x in ("before", "after"))
+        return tuple(
+            float(np.sqrt(np.mean([getattr(g, x) ** 2 for g in self.by_joint.values()]))) for x in ("before", "after")
+        )
 
     @property
     def of_some(self) -> bool:
@@ -223,8 +225,8 @@ class FrfView:
 class Diagnosis:
     """Everything a report or recording shows.
 
-    ``inertias`` of bodies by joint of the description, where they were found; ``parameters`` of the drives; ``timing``, s:
-    delay of the torque against its record that the hold does not explain.
+    ``inertias`` of bodies by joint of the description, where they were found; ``parameters`` of the drives; ``timing``,
+    s: delay of the torque against its record that the hold does not explain.
     """
 
     verdict: Verdict

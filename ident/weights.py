@@ -19,12 +19,14 @@ LINK_ERROR = 0.01  # of the wind-up that link encoders show, up to which what a 
 def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float) -> Weights:
     """Weights at the current model; ``rho`` is a relative error added to the noise.
 
-    Lines of a motion, seen through its window, count in units of the noise of a whole record: neighbours share theirs, and
-    the sum of their squares is that of ``data_count`` independent numbers.
+    Lines of a motion, seen through its window, count in units of the noise of a whole record: neighbours share theirs,
+    and the sum of their squares is that of ``data_count`` independent numbers.
     """
     whiten, covariance = [], []
     known = has_scatter(problem, predictions[0].model)
-    laws = [noise_of_laws(pred, group) if known else None for group, pred in zip(problem.groups, predictions, strict=True)]
+    laws = [
+        noise_of_laws(pred, group) if known else None for group, pred in zip(problem.groups, predictions, strict=True)
+    ]
     for group, pred, of_laws in zip(problem.groups, predictions, laws, strict=True):
         S = output_covariance(problem, group, pred, of_laws)
         k = np.arange(S.shape[1])
@@ -36,7 +38,9 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
             S[:, k, k] += rho**2 * power
             S[1:, k, k] += 1e-2 * rho**2 * power[1:].mean(axis=0)
         if len(links):
-            left = np.mean(np.abs(output_error(group, pred)[:, 1:, links]) ** 2, axis=(0, 1)) - S[1:, links, links].real.mean(axis=0)
+            left = np.mean(np.abs(output_error(group, pred)[:, 1:, links]) ** 2, axis=(0, 1)) - S[
+                1:, links, links
+            ].real.mean(axis=0)
             S[:, links, links] += np.clip(left, 0.0, LINK_ERROR**2 * power[1:, links].mean(axis=0))
         root = np.linalg.inv(np.linalg.cholesky(S)) * np.sqrt(2.0)
         root[0] /= np.sqrt(2.0)
@@ -47,7 +51,8 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
 
 
 def _signals(group: Group, prediction: Prediction) -> np.ndarray:
-    """(S, L, n + M) what errors of a model are relative to: the torque, and the wind-up of the gears that link encoders show."""
+    """(S, L, n + M) what errors of a model are relative to: the torque, and the wind-up of the gears that link encoders
+    show."""
     if not group.links:
         return group.U
     windup = group.Q_link[..., list(group.links)] - group.Q @ prediction.par.coupling[list(group.links)].T

@@ -183,7 +183,7 @@ def _guess(element: ET.Element, inertia: np.ndarray, weight: float) -> JointGues
     effort, velocity = (0.0 if limit is None else _positive(limit.get(key)) for key in ("effort", "velocity"))
     carried = float(np.median(inertia))
     newton, rad, kg = (_unit(u, linear) for u in ("N m", "rad", "kg m2"))
-    reasons = {"gear_ratio": "GUESS: matters only for logs taken on the motor side (side = \"motor\" in a map)"}
+    reasons = {"gear_ratio": 'GUESS: matters only for logs taken on the motor side (side = "motor" in a map)'}
     ratio = 1.0 if linear else GEAR_RATIO
     if velocity > 0:
         reasons["velocity_limit"] = f"{rad}/s, of the URDF"
@@ -198,7 +198,9 @@ def _guess(element: ET.Element, inertia: np.ndarray, weight: float) -> JointGues
         reasons["torque_limit"] = f"{newton}, GUESS: twice the weight, and full speed in 0.1 s"
     if effort > 0 and not linear:
         motor = max(torque / ACCELERATION, MATCH * carried)
-        reasons["motor_inertia"] = f"{kg}, GUESS: {ACCELERATION:g} rad/s2 of the motor alone, {MATCH:g} of what the joint carries at the least"
+        reasons["motor_inertia"] = (
+            f"{kg}, GUESS: {ACCELERATION:g} rad/s2 of the motor alone, {MATCH:g} of what the joint carries at the least"
+        )
     else:
         motor = max(carried, 1e-6)
         reasons["motor_inertia"] = f"{kg}, GUESS: as much as the joint carries"
@@ -208,7 +210,9 @@ def _guess(element: ET.Element, inertia: np.ndarray, weight: float) -> JointGues
         reasons["stiffness"] = f"{newton}/{rad}, GUESS: anti-resonance at {f:g} Hz"
     else:
         stiffness = max(torque / WINDUP, float(inertia.max()) * (2 * np.pi * SOFTEST) ** 2)
-        reasons["stiffness"] = f"{newton}/{rad}, GUESS: {WINDUP * 1e3:.2g} mrad under the torque limit, no anti-resonance below {SOFTEST:g} Hz"
+        reasons["stiffness"] = (
+            f"{newton}/{rad}, GUESS: {WINDUP * 1e3:.2g} mrad under the torque limit, no anti-resonance below {SOFTEST:g} Hz"
+        )
     load = max(carried, 0.1 * motor)  # what a URDF says of the last links is often too little
     reduced = motor * load / (motor + load)
     reasons["damping"] = f"{newton} s/{rad}, GUESS: {DAMPING:.0%} of critical"
@@ -237,8 +241,12 @@ def _check_figures(guess: JointGuess, path: Path) -> None:
         value = getattr(guess.joint, field)
         if not 0 < value <= LARGEST:
             low, high = guess.inertia
-            found = f"{low:.3g} to {high:.3g} {_unit('kg m2', guess.prismatic)} carried, which gives {field} = {value:.3g}"
-            raise DataError(f"joint {guess.joint.name}", str(path), found, "masses and inertias of an arm on the links beyond it")
+            found = (
+                f"{low:.3g} to {high:.3g} {_unit('kg m2', guess.prismatic)} carried, which gives {field} = {value:.3g}"
+            )
+            raise DataError(
+                f"joint {guess.joint.name}", str(path), found, "masses and inertias of an arm on the links beyond it"
+            )
 
 
 def _locked(path: Path, tree: Description, elements: dict[str, ET.Element], lock: dict) -> dict[str, float]:
@@ -250,7 +258,9 @@ def _locked(path: Path, tree: Description, elements: dict[str, ET.Element], lock
         low, high = tree.limits[name]
         given = elements[name].find("limit") is not None and tree.kinds[name] != "continuous"
         if lock[name] is not None and given and not low <= lock[name] <= high:
-            raise DataError("--lock", str(path), f"{name}={lock[name]:g}", f"a position within its limits, {low:g} to {high:g}")
+            raise DataError(
+                "--lock", str(path), f"{name}={lock[name]:g}", f"a position within its limits, {low:g} to {high:g}"
+            )
     for name in tree.limits:
         if elements[name].find("mimic") is not None:
             lock.setdefault(name, None)
@@ -272,7 +282,8 @@ def _seen(
     inertia, weight = np.zeros((POSTURES, len(names))), np.zeros((POSTURES, len(names)))
     q = dict(zip(names, rng.uniform(low, high, (POSTURES, len(names))).T, strict=True))
     q |= {name: np.full(POSTURES, at) for name, at in locked.items()}
-    # All postures at once, (POSTURES, 3, 3) and (POSTURES, 3); without recursion: a chain may be longer than Python's stack.
+    # All postures at once, (POSTURES, 3, 3) and (POSTURES, 3); without recursion: a chain may be longer than Python's
+    # stack.
     start = np.broadcast_to(np.eye(3), (POSTURES, 3, 3))
     stack: list[tuple[str, np.ndarray, np.ndarray, tuple[Carrier, ...]]] = [(base, start, np.zeros((POSTURES, 3)), ())]
     while stack:

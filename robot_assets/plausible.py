@@ -31,7 +31,9 @@ def _of_link(link: ET.Element, name: str) -> list[str]:
     largest = max(float("0" if tensor is None else tensor.get(k, "0")) for k in MOMENTS)
     out = [] if (far := _far(inertial)) is None else [f"the centre of mass of {name} is {far:.3g} m off: in mm?"]
     if m > 0 and np.sqrt(largest / m) > WIDEST:
-        out.append(f"the inertia of {name} is {largest:.3g} kg m2 at {m:.3g} kg, as of a body of {np.sqrt(largest / m):.3g} m: in kg mm2 or g mm2?")
+        out.append(
+            f"the inertia of {name} is {largest:.3g} kg m2 at {m:.3g} kg, as of a body of {np.sqrt(largest / m):.3g} m: in kg mm2 or g mm2?"
+        )
     elif m == 0 and largest > 1.0:
         out.append(f"the inertia of {name} is {largest:.3g} kg m2 without a mass")
     return out

@@ -74,7 +74,12 @@ def read_urdf(path: Path) -> Description:
             if not np.any(axis):
                 raise DataError(f"axis of joint {name}", str(path), "a zero vector", "a direction")
             if not SHORTEST <= np.abs(axis).max():  # the square of less may be zero
-                raise DataError(f"axis of joint {name}", str(path), f"a vector of {np.abs(axis).max():.3g}", "a direction, of about length one")
+                raise DataError(
+                    f"axis of joint {name}",
+                    str(path),
+                    f"a vector of {np.abs(axis).max():.3g}",
+                    "a direction, of about length one",
+                )
             x, y, z = np.asarray(axis) / np.linalg.norm(axis)
             axes[name] = (float(x), float(y), float(z))
         elif joint.get("type") != "fixed":
@@ -148,13 +153,16 @@ def _check_mimics(joints: list[tuple[str, ET.Element]], path: Path) -> None:
         while at in leads and steps <= len(leads):
             at, steps = leads[at], steps + 1
             if at == name:
-                raise DataError(f"mimic of joint {name}", str(path), "itself" if steps == 1 else "a loop of joints", "another joint")
+                raise DataError(
+                    f"mimic of joint {name}", str(path), "itself" if steps == 1 else "a loop of joints", "another joint"
+                )
         if leads[name] not in names:
             raise DataError(f"mimic of joint {name}", str(path), repr(leads[name]), "a joint of the URDF")
 
 
 def completed(path: Path) -> str:
-    """The text of a URDF, with what some readers demand and it does not say: limits (``LIMIT``) and products of inertia."""
+    """The text of a URDF, with what some readers demand and it does not say: limits (``LIMIT``) and products of
+    inertia."""
     root = _root(path)
     for joint in root.iter("joint"):
         if joint.get("type") in ("revolute", "prismatic"):
@@ -190,16 +198,18 @@ def _check_inertial(inertial: ET.Element | None, link: str, path: Path) -> None:
         raise DataError(f"inertial of link {link}", str(path), "no mass or no inertia", "both")
     if _number(mass.get("value"), f"mass of link {link}", path) < 0:
         raise DataError(f"mass of link {link}", str(path), str(mass.get("value")), "at least zero")
-    xx, yy, zz, xy, xz, yz = (
-        _number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in MOMENTS
-    )
+    xx, yy, zz, xy, xz, yz = (_number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in MOMENTS)
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if moments.min() < -NEGATIVE * np.abs(moments).max():
-        raise DataError(f"inertia of link {link}", str(path), f"a moment of {moments.min():.3g} kg m2", "moments of at least zero")
+        raise DataError(
+            f"inertia of link {link}", str(path), f"a moment of {moments.min():.3g} kg m2", "moments of at least zero"
+        )
     a, b, c = moments
     if c - a - b > max(EXCESS * c, SLIGHT):
         found = f"moments of {a:.3g}, {b:.3g} and {c:.3g} kg m2"
-        raise DataError(f"inertia of link {link}", str(path), found, "none larger than the other two together, as of any body")
+        raise DataError(
+            f"inertia of link {link}", str(path), found, "none larger than the other two together, as of any body"
+        )
 
 
 def _numbers(origin: ET.Element | None, what: str, path: Path) -> None:

@@ -67,13 +67,25 @@ def choice(table: dict, key: str, where: str, allowed: tuple[str, ...], default:
 
 
 def number(
-    table: dict, key: str, where: str, *, low: float = -LARGEST, high: float = LARGEST, above: bool = False, default: Any = MISSING
+    table: dict,
+    key: str,
+    where: str,
+    *,
+    low: float = -LARGEST,
+    high: float = LARGEST,
+    above: bool = False,
+    default: Any = MISSING,
 ) -> float:
     """A finite number from ``low`` (``above``: beyond it) to ``high``."""
     value = table.get(key, default)
     sound = isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
     if not sound or (above and value <= low):
-        raise DataError(key, where, show(value), f"a number {'above' if above else 'from'} {low:g} {'and up ' if above else ''}to {high:g}")
+        raise DataError(
+            key,
+            where,
+            show(value),
+            f"a number {'above' if above else 'from'} {low:g} {'and up ' if above else ''}to {high:g}",
+        )
     return float(value)
 
 

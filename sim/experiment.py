@@ -23,10 +23,7 @@ FEED_FORWARD_EVERY = 20  # samples of a motion between postures whose holding to
 
 def draw_drives(rng: np.random.Generator, robot: Robot, factor: float = 2.0) -> dict[str, np.ndarray]:
     """True drive figures within ``factor`` of the nominal ones, log-uniform."""
-    return {
-        f: robot.array(f) * np.exp(rng.uniform(-np.log(factor), np.log(factor), robot.n))
-        for f in DRIVE_FIELDS
-    }
+    return {f: robot.array(f) * np.exp(rng.uniform(-np.log(factor), np.log(factor), robot.n)) for f in DRIVE_FIELDS}
 
 
 def plan_experiment(robot: Robot, postures: np.ndarray, **options: Any) -> Plan:
@@ -148,9 +145,7 @@ def _multisines(
     reference = q0[:, None] if plan.injection == "torque" else q0[:, None] + np.tile(r, (1, x.periods, 1))
     start = np.arange(S) * (N / x.sample_rate + PAUSE)
     controller = Controller(kp, np.zeros_like(kp), kd, hold)
-    record = run_loop(
-        plant, qpos, reference, torque, N, controller, levels, x.sample_rate, rng, start, progress
-    )
+    record = run_loop(plant, qpos, reference, torque, N, controller, levels, x.sample_rate, rng, start, progress)
     if failed(plant, record):
         raise DataError("closed loop", plan.robot.name, "a simulation that diverged", "a smaller effect or step")
     t = np.arange(N) / x.sample_rate
@@ -182,8 +177,16 @@ def _motion(
     ff = ff + inertia * acceleration + plan.robot.array("viscous_friction") * np.gradient(ref, axis=0) * rate
     controller = Controller(kp[None], 2.0 * kp[None], kd[None], ff[None])
     record = run_loop(
-        plant, qpos[None], ref[None], np.zeros((1, 1, plan.robot.n)), len(ref), controller, levels, rate,
-        rng, np.array([clock]),
+        plant,
+        qpos[None],
+        ref[None],
+        np.zeros((1, 1, plan.robot.n)),
+        len(ref),
+        controller,
+        levels,
+        rate,
+        rng,
+        np.array([clock]),
     )
     if failed(plant, record):
         raise DataError("closed loop", move.name, "a motion that diverged", "a smaller effect or step")

@@ -193,5 +193,3 @@ def failed(plant: Plant, record: Record) -> bool:
 
 def _lost(q: np.ndarray) -> bool:
     return not bool(np.abs(q).max() <= FARTHEST)  # NaN too
-
-

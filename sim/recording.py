@@ -90,7 +90,13 @@ def _controller(plant: Plant, schedule: Schedule, rate: float) -> Controller:
         if q[k].tobytes() not in known:
             known[q[k].tobytes()] = link_inertia_diagonal(plant, q[k]), rest(plant, q[k])[1]
     inertia, hold = (
-        np.stack([np.interp(np.arange(N), knots, column) for column in np.stack([known[q[k].tobytes()][i] for k in knots]).T], axis=1)
+        np.stack(
+            [
+                np.interp(np.arange(N), knots, column)
+                for column in np.stack([known[q[k].tobytes()][i] for k in knots]).T
+            ],
+            axis=1,
+        )
         for i in range(2)
     )
     kp, kd = loop_gains(inertia)

@@ -16,7 +16,9 @@ from sim.experiment import draw_drives, plan_experiment
 threadpool_limits(1)  # workers share the cores: threads of each would only wait for each other, ten times as long
 
 
-def small_plan(robot, seed, *, points=2, levels=(1.0, 0.4), period=2000, validation_points=1, trajectory=False, **kwargs):
+def small_plan(
+    robot, seed, *, points=2, levels=(1.0, 0.4), period=2000, validation_points=1, trajectory=False, **kwargs
+):
     """A plan of 2 s periods, scaled to the arm."""
     postures = operating_points(robot, points + validation_points, np.random.default_rng(seed))
     return plan_experiment(
@@ -33,7 +35,8 @@ def small_plan(robot, seed, *, points=2, levels=(1.0, 0.4), period=2000, validat
 
 
 def through_postures(rng, n, rate, seconds):
-    """Times, and positions, velocities and accelerations of a motion through many postures, of five lines from 0.1 Hz on."""
+    """Times, and positions, velocities and accelerations of a motion through many postures, of five lines from 0.1 Hz
+    on."""
     t = np.arange(int(seconds * rate)) / rate
     w = 2 * np.pi * 0.1 * np.arange(1, 6)
     a, b = rng.normal(size=(2, 5, n)) * 0.25

@@ -89,7 +89,8 @@ def test_a_law_that_is_nothing_leaves_what_the_loop_leaves(clean):
     backlash = next(h for h in catalogue(problem.structure) if h.key == ("backlash", "shoulder_pan_joint"))
     nothing = Effect(backlash, np.array([1e-9, 0.0]))
     (_, loop), (_, along) = (
-        cost_of(problem, replace(model, effects=(replace(nothing, hypothesis=h),))) for h in (backlash, along_record(backlash))
+        cost_of(problem, replace(model, effects=(replace(nothing, hypothesis=h),)))
+        for h in (backlash, along_record(backlash))
     )
     for a, b, group in zip(loop, along, problem.groups, strict=True):
         if group.window is None:
@@ -175,7 +176,8 @@ def test_a_gear_with_one_steady_motion_ends_as_a_loop(tmp_path, cubic):
 
 
 def test_a_law_is_begun_from_other_sizes_where_it_leaves_more_than_noise(identified, monkeypatch):
-    """Between two sizes at which a record changes to another motion the cost has a minimum each: the best of them stays."""
+    """Between two sizes at which a record changes to another motion the cost has a minimum each: the best of them
+    stays."""
     _, setup, result = identified
     problem, k = setup.problem, setup.problem.nominal.stiffness[2]
     h = next(h for h in catalogue(problem.structure) if h.key == ("softening_stiffness", "elbow_joint"))

@@ -16,7 +16,8 @@ from ident.dataset import Segment
     target=st.floats(3.0, 100.0),
 )
 def test_an_effect_is_brought_to_its_size(at_one, power, bend, target):
-    """By few trials, also where its size grows as no power of its strength; as near as a strength that a machine may have."""
+    """By few trials, also where its size grows as no power of its strength; as near as a strength that a machine may
+    have."""
 
     def size(strength: float) -> float:
         return at_one * strength**power * (1.0 + strength) ** -bend

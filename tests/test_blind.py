@@ -53,7 +53,8 @@ def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path, power, coe
 
     @dataclass(frozen=True)
     class Drag:
-        """Drag with a power of the speed, which the catalogue lacks; linear within 1 mrad/s, so that it can be stepped."""
+        """Drag with a power of the speed, which the catalogue lacks; linear within 1 mrad/s, so that it can be
+        stepped."""
 
         place: str
 
@@ -118,7 +119,8 @@ def test_friction_of_every_joint_counts_once(ur10, tmp_path):
 
 @pytest.mark.slow
 def test_a_cable_that_gives_before_it_slips_is_named_with_its_friction(ur10, tmp_path):
-    """The plant of the other tests has cables whose friction turns over with the velocity; here it does with the path."""
+    """The plant of the other tests has cables whose friction turns over with the velocity; here it does with the
+    path."""
     from collections.abc import Callable
     from dataclasses import dataclass
 
@@ -171,7 +173,9 @@ def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
             spec.joint(f"link:{self.place}").damping = [coefficient, 0, 0]
 
     drives = draw_drives(np.random.default_rng(5), ur10)
-    data = run_experiment(small_plan(ur10, 5, points=1, levels=(1.0,), period=1000), [LinkFriction("elbow_joint")], seed=5, drives=drives)
+    data = run_experiment(
+        small_plan(ur10, 5, points=1, levels=(1.0,), period=1000), [LinkFriction("elbow_joint")], seed=5, drives=drives
+    )
     result = diagnose_fully(through_files(data, tmp_path))
     verdict = result.verdict
     assert verdict.unexplained_verdict == "unknown cause remains"

@@ -105,20 +105,44 @@ FAULTS = {
     "link encoder in degrees": (lambda s: replace(s, q_link=change(s.q_link, 0, np.rad2deg)), "q_link_1"),
     "no torque": (lambda s: replace(s, tau=change(s.tau, 3, np.zeros_like)), "tau_4 (wrist_1_joint) is frozen"),
     "torque clipped": (lambda s: replace(s, tau=np.clip(s.tau, -140, 140)), "tau_2 (shoulder_lift_joint) is clipped"),
-    "torque frozen": (lambda s: replace(s, tau=change(s.tau, 1, frozen)), "tau_2 (shoulder_lift_joint) stands still for 0.2 s"),
-    "position frozen": (lambda s: replace(s, q=change(s.q, 1, frozen), qd=None, q_link=None), "q_2 (shoulder_lift_joint) stands still for 0.2 s"),
+    "torque frozen": (
+        lambda s: replace(s, tau=change(s.tau, 1, frozen)),
+        "tau_2 (shoulder_lift_joint) stands still for 0.2 s",
+    ),
+    "position frozen": (
+        lambda s: replace(s, q=change(s.q, 1, frozen), qd=None, q_link=None),
+        "q_2 (shoulder_lift_joint) stands still for 0.2 s",
+    ),
     "samples lost": (lambda s: without(s), "double steps"),
     "samples repeated": (lambda s: repeated(s), "repeat the one before"),
-    "one joint at rest": (lambda s: replace(s, q=change(s.q, 5, lambda x: 1e-4 * x), qd=None, q_link=None), "joints 6 hardly move"),
-    "one direction": (lambda s: replace(s, q=change(s.q, 0, lambda x: np.linspace(0, 1, len(x)) + 1e-6 * x), qd=None, q_link=None), "joints 1 move in one direction"),
+    "one joint at rest": (
+        lambda s: replace(s, q=change(s.q, 5, lambda x: 1e-4 * x), qd=None, q_link=None),
+        "joints 6 hardly move",
+    ),
+    "one direction": (
+        lambda s: replace(s, q=change(s.q, 0, lambda x: np.linspace(0, 1, len(x)) + 1e-6 * x), qd=None, q_link=None),
+        "joints 1 move in one direction",
+    ),
     "filtered": (lambda s: replace(s, tau=smooth(s.tau)), "the log was filtered"),
     "torque late": (lambda s: replace(s, tau=np.roll(s.tau, 6, axis=0)), "torque comes 12 ms after"),
     "torque of the wrong sign": (lambda s: replace(s, tau=-s.tau), "tau_1 (shoulder_pan_joint) runs against"),
-    "one torque of the wrong sign": (lambda s: replace(s, tau=change(s.tau, 2, np.negative)), "tau_3 (elbow_joint) runs against"),
-    "one torque before the gear": (lambda s: replace(s, tau=change(s.tau, 1, lambda x: x / 101)), "tau_2 (shoulder_lift_joint) is 0.0"),
-    "torques swapped": (lambda s: replace(s, tau=s.tau[:, [0, 2, 1, 3, 4, 5]]), "tau_2 (shoulder_lift_joint) follows what joint 3 needs"),
+    "one torque of the wrong sign": (
+        lambda s: replace(s, tau=change(s.tau, 2, np.negative)),
+        "tau_3 (elbow_joint) runs against",
+    ),
+    "one torque before the gear": (
+        lambda s: replace(s, tau=change(s.tau, 1, lambda x: x / 101)),
+        "tau_2 (shoulder_lift_joint) is 0.0",
+    ),
+    "torques swapped": (
+        lambda s: replace(s, tau=s.tau[:, [0, 2, 1, 3, 4, 5]]),
+        "tau_2 (shoulder_lift_joint) follows what joint 3 needs",
+    ),
     "a position of the wrong sign": (lambda s: replace(s, q=change(s.q, 1, np.negative), qd=None, q_link=None), "what"),
-    "link late": (lambda s: replace(s, q_link=np.roll(s.q_link, 2, axis=0)), "q_link_1 (shoulder_pan_joint) comes 4 ms after"),
+    "link late": (
+        lambda s: replace(s, q_link=np.roll(s.q_link, 2, axis=0)),
+        "q_link_1 (shoulder_pan_joint) comes 4 ms after",
+    ),
 }
 
 
@@ -173,16 +197,27 @@ def test_skews_are_estimated_within_their_deviation(name, late):
         assert abs(k.late - late) < 4 * k.std + 2e-4 and k.std < 1e-3, k
 
 
-@pytest.mark.parametrize("name", ["emps", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ur10_bare", "panda_bare"))])
+@pytest.mark.parametrize(
+    "name", ["emps", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ur10_bare", "panda_bare"))]
+)
 def test_skews_of_less_than_a_sample_are_said_where_they_are_sure(name):
     robot, rate, found = load_robot(name), 250.0, {0.0: [], 0.6: [], -0.5: []}
     for seed in range(3):
         for late, said in found.items():
-            s = recording(robot, np.random.default_rng(seed), late=late / rate, q_link_late=max(late, 0.0) / rate, N=3000, rate=rate)
+            s = recording(
+                robot,
+                np.random.default_rng(seed),
+                late=late / rate,
+                q_link_late=max(late, 0.0) / rate,
+                N=3000,
+                rate=rate,
+            )
             said += skew_warnings(s, replace(dataset(robot, s), sample_rate=rate))
     assert found[0.0] == []
     after = [w for w in found[0.6] if w.startswith("torque")]
-    assert len(after) == 3 and all(abs(float(w.split()[2]) - 2.4) < 0.3 and "ms after the positions" in w for w in after)
+    assert len(after) == 3 and all(
+        abs(float(w.split()[2]) - 2.4) < 0.3 and "ms after the positions" in w for w in after
+    )
     assert sum(w.startswith("q_link_1") and "2.4 ms after q_1" in w for w in found[0.6]) == 3
     held = [w for w in found[-0.5] if w.startswith("torque")]
     assert len(held) == 3 and all("before the positions" in w and 'input_hold = "zoh"' in w for w in held)
@@ -206,7 +241,11 @@ def test_a_multisine_experiment_gives_no_warning(clean):
 @pytest.mark.parametrize("kind", ["noise", "constant", "huge"])
 def test_short_and_odd_recordings_are_reported_too(arm, samples, kind):
     rng = np.random.default_rng(0)
-    x = {"noise": rng.normal(size=(samples, 6)), "constant": np.ones((samples, 6)), "huge": 1e12 * rng.normal(size=(samples, 6))}[kind]
+    x = {
+        "noise": rng.normal(size=(samples, 6)),
+        "constant": np.ones((samples, 6)),
+        "huge": 1e12 * rng.normal(size=(samples, 6)),
+    }[kind]
     q_link = np.where(np.arange(6) < 3, x, np.nan)
     for rate in (1e-2, 1e3, 1e6):
         s = Segment("log", "trajectory", "identification", np.arange(samples) / rate, x, x, qd=x, q_link=q_link)
@@ -298,7 +337,9 @@ def test_what_no_model_is_fitted_to_and_what_no_gain_is_measured_by_is_told(clea
     def told(*segments):
         return " ".join(inspect_dataset(replace(data, segments=segments)).warnings)
 
-    assert f"{motion.name} of role identification: nothing is fitted to motions beside multisines" in told(*fitted, replace(motion, role="identification"))
+    assert f"{motion.name} of role identification: nothing is fitted to motions beside multisines" in told(
+        *fitted, replace(motion, role="identification")
+    )
     assert "beside multisines" not in told(*fitted, motion)
     assert "leaving operating points out" in told(*fitted)
     assert "no gain can be measured" in told(*(s for s in fitted if s.operating_point == fitted[0].operating_point))

@@ -13,7 +13,13 @@ from ident.dataset_io import save_dataset
 
 
 def simgap(*args, timeout=300):
-    return subprocess.run([sys.executable, "-m", "ident.cli", *map(str, args)], capture_output=True, text=True, timeout=timeout, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "ident.cli", *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -43,21 +49,48 @@ def test_diagnose_writes_everything(dataset, tmp_path):
     run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--json", "--quiet")
     assert run.returncode == 0 and not run.stderr
     assert json.loads(run.stdout) == json.loads((tmp_path / "out" / "verdict.json").read_text())
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"verdict.json", "report.html", "recording.rrd", "model.toml", "model.xml"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "verdict.json",
+        "report.html",
+        "recording.rrd",
+        "model.toml",
+        "model.xml",
+    }
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     """(dataset of a drive with friction as the command writes it, what the command returned)."""
     folder = tmp_path_factory.mktemp("bench") / "d"
-    return folder, simgap("experiment", "twomass", "--out", folder, "--effect", "coulomb_friction@drive:torque=0.3", "--points", 1, "--quiet")
+    return folder, simgap(
+        "experiment",
+        "twomass",
+        "--out",
+        folder,
+        "--effect",
+        "coulomb_friction@drive:torque=0.3",
+        "--points",
+        1,
+        "--quiet",
+    )
 
 
 def test_diagnose_takes_an_executor_and_a_time(bench, tmp_path):
     dataset, _ = bench
     run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--executor", "cores")
     assert run.returncode == 2 and "--executor" in run.stderr and not (tmp_path / "out").exists()
-    run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--executor", "processes:2", "--max-seconds", 0, "--json", "--quiet")
+    run = simgap(
+        "diagnose",
+        dataset,
+        "--out",
+        tmp_path / "out",
+        "--executor",
+        "processes:2",
+        "--max-seconds",
+        0,
+        "--json",
+        "--quiet",
+    )
     assert run.returncode == 0, run.stderr
     assert "0 s for the search" in json.loads(run.stdout)["notes"][-1]
 
@@ -84,7 +117,14 @@ def test_experiment_writes_a_dataset_that_checks(bench):
     ids=lambda a: "-".join(a[:2]),
 )
 def test_bad_usage_is_one_line_and_status_two(args, tmp_path):
-    run = subprocess.run([sys.executable, "-m", "ident.cli", *args], capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path)
+    run = subprocess.run(
+        [sys.executable, "-m", "ident.cli", *args],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=tmp_path,
+    )
     assert run.returncode == 2, run.stderr
     assert len(run.stderr.strip().splitlines()) == 1 and "Traceback" not in run.stderr
     assert not any(tmp_path.iterdir())

@@ -28,7 +28,14 @@ def torque(t):
 
 
 def written(path, **columns):
-    np.savetxt(path, np.stack(list(columns.values()), axis=1), header=",".join(columns), comments="", delimiter=",", fmt="%.12g")
+    np.savetxt(
+        path,
+        np.stack(list(columns.values()), axis=1),
+        header=",".join(columns),
+        comments="",
+        delimiter=",",
+        fmt="%.12g",
+    )
     return path
 
 
@@ -108,7 +115,9 @@ def test_a_faster_log_is_filtered_and_said_to_be(tmp_path):
     said = []
     data = convert_logs([log], "twomass", mapped(tmp_path, f"sample_rate = 250.0\n{CLOCK}{BENCH}"), say=said.append)
     s = data.segments[0]
-    assert np.allclose(s.tau[100:-100, 0], torque(s.t)[100:-100], atol=2e-3) and np.allclose(s.q[:, 0], angle(s.t), atol=1e-3)
+    assert np.allclose(s.tau[100:-100, 0], torque(s.t)[100:-100], atol=2e-3) and np.allclose(
+        s.q[:, 0], angle(s.t), atol=1e-3
+    )
     assert "it has 1000 Hz: filtered below 125 Hz" in said[0] and s.filled is None
 
 
@@ -128,7 +137,9 @@ def test_files_with_clocks_of_their_own_are_joined_where_both_have_samples(tmp_p
     written(tmp_path / "cur.csv", t=later, u=torque(later))
     text = "sample_rate = 200.0\n" + WAYS[way] + OWN.format(more=", unwrap = true" if wraps else "")
     said = []
-    data = convert_logs([tmp_path / "cur.csv", tmp_path / "pos.csv"], "twomass", mapped(tmp_path, text), say=said.append)
+    data = convert_logs(
+        [tmp_path / "cur.csv", tmp_path / "pos.csv"], "twomass", mapped(tmp_path, text), say=said.append
+    )
     (s,) = data.segments
     assert s.t[0] == 0.0 and s.t[-1] == pytest.approx(119.001 - 101.003, abs=0.01) and len(said) == 2
     on = 101.003 + s.t
@@ -148,12 +159,17 @@ def test_files_whose_spans_do_not_overlap_are_one_clear_error(tmp_path):
     (s,) = convert_logs(files, "twomass", mapped(tmp_path, text % ", shift = 500.0" + columns)).segments
     assert np.allclose(s.q[:, 0], angle(at)) and np.allclose(s.tau[:, 0], torque(at))
     with pytest.raises(DataError, match="a time for each of the files"):
-        convert_logs(files, "twomass", mapped(tmp_path, (text % "" + columns).replace('"cur.csv", time = "t"', '"cur.csv"')))
+        convert_logs(
+            files, "twomass", mapped(tmp_path, (text % "" + columns).replace('"cur.csv", time = "t"', '"cur.csv"'))
+        )
 
 
 def test_a_map_is_guessed_for_files_with_clocks_of_their_own(tmp_path):
     at, later = 5.0 + np.arange(2000) / 100.0, 5.3 + np.arange(9000) / 500.0
-    pair = {f"pos_{j + 1}": angle(at + j) for j in range(6)}, {f"torque_{j + 1}": 50 * torque(later + j) for j in range(6)}
+    pair = (
+        {f"pos_{j + 1}": angle(at + j) for j in range(6)},
+        {f"torque_{j + 1}": 50 * torque(later + j) for j in range(6)},
+    )
     written(tmp_path / "pos.csv", stamp_ms=1e3 * at, **pair[0])
     written(tmp_path / "cur.csv", t=later, **pair[1])
     files = [tmp_path / "cur.csv", tmp_path / "pos.csv"]
@@ -164,4 +180,6 @@ def test_a_map_is_guessed_for_files_with_clocks_of_their_own(tmp_path):
     t = 5.3 + np.arange(sum(len(s.t) for s in data.segments)) / 100.0
     q, tau = (np.concatenate([getattr(s, c) for s in data.segments]) for c in ("q", "tau"))
     for j in range(6):
-        assert np.allclose(q[:, j], angle(t + j), atol=2e-3) and np.allclose(tau[50:-50, j], 50 * torque(t + j)[50:-50], atol=1e-2)
+        assert np.allclose(q[:, j], angle(t + j), atol=2e-3) and np.allclose(
+            tau[50:-50, j], 50 * torque(t + j)[50:-50], atol=1e-2
+        )

@@ -75,7 +75,13 @@ def test_a_cut_recording_is_an_ordinary_dataset(recorded, tmp_path):
     separate = run_experiment(schedule.plan)
     assert [s.name for s in data.segments] == [s.name for s in separate.segments]
     for a, b in zip(data.segments, separate.segments, strict=True):
-        assert (a.kind, a.role, a.experiment, a.period, a.periods) == (b.kind, b.role, b.experiment, b.period, b.periods)
+        assert (a.kind, a.role, a.experiment, a.period, a.periods) == (
+            b.kind,
+            b.role,
+            b.experiment,
+            b.period,
+            b.periods,
+        )
         assert a.n_samples == b.n_samples and np.array_equal(a.excited_lines, b.excited_lines)
         assert (a.r is None) == (b.r is None) and (a.r is None or np.allclose(a.r, b.r))
         assert np.abs(np.mean(a.q - b.q, axis=0)).max() < 1e-2
@@ -101,7 +107,9 @@ def test_frfs_and_parameters_agree_with_those_of_separate_experiments(recorded, 
 
 def test_a_position_reference_carries_the_excitation_too(tmp_path):
     robot = load_robot("twomass")
-    plan = make_plan(robot, points=1, validation_points=0, levels=(1.0,), period=1000, injection="position", trajectory=False)
+    plan = make_plan(
+        robot, points=1, validation_points=0, levels=(1.0,), period=1000, injection="position", trajectory=False
+    )
     schedule = schedule_plan(plan, settle=0.2)
     data = cut_recording(run_recording(schedule), schedule)
     s = data.segments[0]
@@ -147,7 +155,9 @@ def test_a_plan_that_cannot_be_run_is_refused(recorded):
 
 def test_the_command_writes_a_dataset_and_counts_its_samples(tmp_path):
     args = ["experiment", "twomass", "--out", str(tmp_path / "d"), "--points", "1", "--one-recording", "--json"]
-    run = subprocess.run([sys.executable, "-m", "ident.cli", *args], capture_output=True, text=True, check=False, timeout=300)
+    run = subprocess.run(
+        [sys.executable, "-m", "ident.cli", *args], capture_output=True, text=True, check=False, timeout=300
+    )
     assert run.returncode == 0, run.stderr
     found, data = json.loads(run.stdout), load_dataset(tmp_path / "d")
     assert found["segments"] == len(data.segments)

@@ -18,12 +18,35 @@ def folder(tmp_path, ur10):
     N, n = 200, 6
     common = dict(t=3.0 + np.arange(N) / 1000.0, role="identification")
     multisine = Segment(
-        name="a", kind="multisine", tau=rng.normal(size=(N, n)), q=rng.normal(size=(N, n)), r=rng.normal(size=(N, n)),
-        operating_point="op01", q0=np.zeros(n), period=100, periods=2, transient_periods=1, experiment=1,
-        realization=1, amplitude=0.5, excited_lines=np.array([3, 5]), **common,
+        name="a",
+        kind="multisine",
+        tau=rng.normal(size=(N, n)),
+        q=rng.normal(size=(N, n)),
+        r=rng.normal(size=(N, n)),
+        operating_point="op01",
+        q0=np.zeros(n),
+        period=100,
+        periods=2,
+        transient_periods=1,
+        experiment=1,
+        realization=1,
+        amplitude=0.5,
+        excited_lines=np.array([3, 5]),
+        **common,
     )
     motion = Segment(name="b", kind="trajectory", tau=rng.normal(size=(N, n)), q=rng.normal(size=(N, n)), **common)
-    data = Dataset("small", "ur10", ur10, 1000.0, ur10.joint_names, "zoh", np.full(n, 1e-6), np.full(n, 0.1), None, (multisine, motion))
+    data = Dataset(
+        "small",
+        "ur10",
+        ur10,
+        1000.0,
+        ur10.joint_names,
+        "zoh",
+        np.full(n, 1e-6),
+        np.full(n, 0.1),
+        None,
+        (multisine, motion),
+    )
     save_dataset(data, tmp_path / "d")
     return tmp_path / "d", data
 

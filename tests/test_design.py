@@ -33,7 +33,9 @@ def quadratic(x=AXIS):
     return rows[:, :, None] * rows[:, None, :]
 
 
-@pytest.mark.parametrize(("criterion", "ends", "middle"), [("D", 1 / 3, 1 / 3), ("A", 1 / 4, 1 / 2), ("E", 1 / 5, 3 / 5)])
+@pytest.mark.parametrize(
+    ("criterion", "ends", "middle"), [("D", 1 / 3, 1 / 3), ("A", 1 / 4, 1 / 2), ("E", 1 / 5, 3 / 5)]
+)
 def test_parabola_is_measured_where_the_textbook_says(criterion, ends, middle):
     """Pukelsheim 1993, ch. 9: weight on -1, 0 and 1 alone."""
     best = optimal_weights(quadratic(), criterion=criterion, tolerance=1e-6)
@@ -84,12 +86,15 @@ def test_a_design_for_two_draws_serves_both():
     assert loss(both, 0) + loss(both, 1) < min(sum(loss(w, d) for d in (0, 1)) for w in own)
 
 
-@pytest.mark.parametrize(("weights", "points", "expected"), [
-    ([0.5, 0.3, 0.2], 10, [5, 3, 2]),
-    ([1 / 6, 1 / 3, 1 / 2, 0.0], 4, [1, 1, 2, 0]),
-    ([0.4, 0.35, 0.25], 2, [1, 1, 0]),
-    ([1.0, 0.0], 3, [3, 0]),
-])
+@pytest.mark.parametrize(
+    ("weights", "points", "expected"),
+    [
+        ([0.5, 0.3, 0.2], 10, [5, 3, 2]),
+        ([1 / 6, 1 / 3, 1 / 2, 0.0], 4, [1, 1, 2, 0]),
+        ([0.4, 0.35, 0.25], 2, [1, 1, 0]),
+        ([1.0, 0.0], 3, [3, 0]),
+    ],
+)
 def test_apportionment(weights, points, expected):
     assert apportion(np.array(weights), points).tolist() == expected
 
@@ -173,7 +178,9 @@ def test_no_collision_geometry_is_said():
     assert "not checked" in draw_candidates(load_robot("twomass"), 5, np.random.default_rng(0)).note
 
 
-@pytest.mark.parametrize(("name", "criterion", "least"), [("irb", "D", 3.0), ("ur10", "D", 3.0), ("ur10", "A", 1.3), ("irb", "E", 1.3)])
+@pytest.mark.parametrize(
+    ("name", "criterion", "least"), [("irb", "D", 3.0), ("ur10", "D", 3.0), ("ur10", "A", 1.3), ("irb", "E", 1.3)]
+)
 def test_a_design_beats_random_choices(name, criterion, least):
     design = design_experiment(load_robot(name), points=8, candidates=150, criterion=criterion, seed=1, per_decade=20)
     assert design.weights.gap < 1e-3

@@ -1,4 +1,5 @@
-"""Noise of the position, in both factors of the normal equations: taken off exactly, and no further than the data bear."""
+"""Noise of the position, in both factors of the normal equations: taken off exactly, and no further than the data
+bear."""
 
 from dataclasses import replace
 
@@ -25,7 +26,10 @@ from tests.conftest import small_plan
 STEP = 1e-5
 
 
-@pytest.mark.parametrize("named", [None, ("torque_lag", 1e-3), ("sensor_delay", 1e-3), ("unknown:link_friction", 20.0), ("torque_constant", 1.1)])
+@pytest.mark.parametrize(
+    "named",
+    [None, ("torque_lag", 1e-3), ("sensor_delay", 1e-3), ("unknown:link_friction", 20.0), ("torque_constant", 1.1)],
+)
 def test_the_slope_of_what_noise_adds_is_its_derivative(identified, named):
     _, setup, result = identified
     problem, model = setup.problem, result.model
@@ -51,13 +55,16 @@ def test_the_slope_of_what_noise_adds_is_its_derivative(identified, named):
 def noisy(ur10):
     """(problem, true parameters) at ten times the noise of the arm."""
     drives = draw_drives(np.random.default_rng(6), ur10)
-    problem = set_up(run_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0, timestep=5e-4)).problem
+    problem = set_up(
+        run_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0, timestep=5e-4)
+    ).problem
     names = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
     return problem, replace(problem.nominal, **{mine: drives[its] for mine, its in names.items()})
 
 
 def test_noise_of_the_position_moves_no_parameter(noisy, monkeypatch):
-    """At ten times the noise of the arm errors are as large as their deviations say; of plain least squares, twice that."""
+    """At ten times the noise of the arm errors are as large as their deviations say; of plain least squares, twice
+    that."""
     problem, truth = noisy
 
     def off():
@@ -93,7 +100,8 @@ def test_noise_of_the_position_moves_no_parameter_in_a_single_period(ur10, monke
 
 @pytest.mark.parametrize("factor, periods", [(0.5, 4), (2.0, 4), (0.5, 1), (2.0, 1)])
 def test_the_noise_that_a_model_passes_on_counts_neither_for_nor_against_it(clean, factor, periods):
-    """Of a stiffer and of a softer gear that is what they are off by without noise, and of plain sums of squares far from it.
+    """Of a stiffer and of a softer gear that is what they are off by without noise, and of plain sums of squares far
+    from it.
 
     By the scatter between periods, or the noise that is known of one.
     """
@@ -152,6 +160,8 @@ def test_no_more_is_taken_off_than_leaves_information(identified):
 
 def test_an_effect_that_the_data_do_not_feel_is_no_candidate(identified):
     _, setup, result = identified
-    h = next(h for h in catalogue(setup.problem.structure) if (h.effect, h.place) == ("torque_saturation", "elbow_joint"))
+    h = next(
+        h for h in catalogue(setup.problem.structure) if (h.effect, h.place) == ("torque_saturation", "elbow_joint")
+    )
     model = replace(result.model, effects=(Effect(h, np.array([1e6, 0.03])),))
     assert refit(setup.problem, model, result.weights, result.remainders, 1) is None

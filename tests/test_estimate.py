@@ -24,8 +24,11 @@ def arm(ur10):
     rng = np.random.default_rng(11)
     nominal = Parameters.nominal(ur10)
     x = nominal.to_log()
-    return build_structure(ur10), nominal, nominal.with_log(x + rng.uniform(-np.log(2), np.log(2), len(x))), np.array(
-        operating_points(ur10, 2, rng)
+    return (
+        build_structure(ur10),
+        nominal,
+        nominal.with_log(x + rng.uniform(-np.log(2), np.log(2), len(x))),
+        np.array(operating_points(ur10, 2, rng)),
     )
 
 
@@ -86,10 +89,16 @@ def test_drives_off_by_two_are_found(arm, estimator):
 
 @pytest.mark.parametrize("estimator", ["wnls", "wlls"])
 def test_records_without_noise_are_fitted_to_what_rounding_leaves(arm, estimator):
-    """A simulation without noise repeats to the last digit: covariances next to nothing, or none of some lines but rounding."""
+    """A simulation without noise repeats to the last digit: covariances next to nothing, or none of some lines but
+    rounding."""
     structure, _, truth, postures = arm
     frf = measured(model_of(structure, truth, postures), postures, np.random.default_rng(0), relative=1e-12)
-    frf = replace(frf, covariance=1e-306 * (1.0 + np.arange(len(BAND)))[None, :, None, None] * np.eye(structure.n**2, dtype=complex)[None, None].repeat(len(postures), 0))
+    frf = replace(
+        frf,
+        covariance=1e-306
+        * (1.0 + np.arange(len(BAND)))[None, :, None, None]
+        * np.eye(structure.n**2, dtype=complex)[None, None].repeat(len(postures), 0),
+    )
     result = fit(arm, frf, estimator=estimator)
     assert np.all(np.isfinite(result.covariance)) and np.abs(log_error(result, truth)).max() < 1e-5
 
@@ -170,7 +179,9 @@ def test_weak_entries_do_not_bias_weighted_log_fits(arm):
     structure, _, truth, postures = arm
     G, z = model_of(structure, truth, postures), []
     for seed in range(16):
-        result = fit(arm, measured(G, postures, np.random.default_rng(seed), floor=0.03), truth, estimator="wlls", search=False)
+        result = fit(
+            arm, measured(G, postures, np.random.default_rng(seed), floor=0.03), truth, estimator="wlls", search=False
+        )
         z.append(log_error(result, truth) / np.sqrt(np.diag(result.covariance))[:-1])
     mean = np.mean(z, axis=0) * np.sqrt(len(z))
     assert np.sum(mean**2) < chi2.ppf(1 - 1e-3, mean.size)

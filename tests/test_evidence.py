@@ -71,7 +71,8 @@ def candidate(h, p, information, cost=1000.0):
 
 
 def test_what_another_cause_leaves_at_its_joint_blurs_little_elsewhere(named):
-    """Two causes that differ by 120 at joints 1 to 5, of which the better one leaves 1e4 of a cause that is missing at joint 6."""
+    """Two causes that differ by 120 at joints 1 to 5, of which the better one leaves 1e4 of a cause that is missing at
+    joint 6."""
     one, other = named["torque_delay", "elbow_joint"], named["torque_delay", "wrist_1_joint"]
     counts = np.full(6, 1e3)
     left = counts + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e4])
@@ -88,7 +89,8 @@ def test_what_another_cause_leaves_at_its_joint_blurs_little_elsewhere(named):
 
     assert odds(np.array([24.0] * 5 + [0.0])) == pytest.approx(0.5 * 120.0 / (TEMPER + 0.05 * LAW_ERROR * above))
     assert odds(np.array([0.0] * 5 + [120.0])) == pytest.approx(0.5 * 120.0 / (TEMPER + 0.05 * excess[-1]))
-    # One that explains far less of joint 6 is another cause, and wins nothing by the little that it explains at joints 1 to 5.
+    # One that explains far less of joint 6 is another cause, and wins nothing by the little that it explains at joints
+    # 1 to 5.
     at_last = np.array([0.0] * 5 + [1e4])
     elsewhere = np.array([-24.0] * 5 + [1e3])
     assert odds(elsewhere, at_last) == pytest.approx(0.5 * 880.0 / (TEMPER + 0.05 * excess[-1]))
@@ -99,7 +101,10 @@ def replace_costs(fit, costs):
     return SimpleNamespace(**{**vars(fit), "cost": float(np.sum(costs)), "costs": costs})
 
 
-@pytest.mark.parametrize(("motor", "turned"), [("shoulder_lift_joint", "elbow_joint"), ("wrist_1_joint", "wrist_3_joint"), ("wrist_2_joint", "elbow_joint")])
+@pytest.mark.parametrize(
+    ("motor", "turned"),
+    [("shoulder_lift_joint", "elbow_joint"), ("wrist_1_joint", "wrist_3_joint"), ("wrist_2_joint", "elbow_joint")],
+)
 def test_a_coupling_of_any_two_joints_is_screened_by_its_derivative(identified, motor, turned):
     """Against the difference of two arms at one posture."""
     _, setup, result = identified
@@ -209,7 +214,12 @@ def test_a_power_of_the_speed_at_its_bounds_is_the_friction_of_the_catalogue(nam
 
 @pytest.mark.parametrize(
     ("second", "left", "expected"),
-    [("hardening_stiffness", 30.0, True), ("hardening_stiffness", 80.0, False), ("cogging", 30.0, False), ("cogging", 0.5, True)],
+    [
+        ("hardening_stiffness", 30.0, True),
+        ("hardening_stiffness", 80.0, False),
+        ("cogging", 30.0, False),
+        ("cogging", 0.5, True),
+    ],
 )
 def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shadow(named, second, left, expected):
     def round_of(h, before, after, joint=2):
@@ -230,7 +240,9 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
     assert not shadowed(rub, (spring, rub))  # what a spring lacks is no friction
 
 
-@pytest.mark.parametrize(("periods", "left", "expected"), [(3770.0, 95.0, True), (3770.0, 0.0, False), (3000.0, 95.0, False)])
+@pytest.mark.parametrize(
+    ("periods", "left", "expected"), [(3770.0, 95.0, True), (3770.0, 0.0, False), (3000.0, 95.0, False)]
+)
 def test_a_weak_ripple_at_a_multiple_of_the_periods_of_another_is_its_overtone(named, periods, left, expected):
     """No ripple of a machine is a sine: the second harmonic of a cogging is no error of the transmission."""
 
@@ -239,7 +251,13 @@ def test_a_weak_ripple_at_a_multiple_of_the_periods_of_another_is_its_overtone(n
         model = SimpleNamespace(effects=(Effect(h, p),))
         costs = [np.full(6, 10.0), np.full(6, 10.0)]
         costs[0][2], costs[1][2] = before, after
-        return Round(SimpleNamespace(costs=costs[0]), (Candidate(h, SimpleNamespace(costs=costs[1], model=model), 0.0),), (), 1.0, 1.0)
+        return Round(
+            SimpleNamespace(costs=costs[0]),
+            (Candidate(h, SimpleNamespace(costs=costs[1], model=model), 0.0),),
+            (),
+            1.0,
+            1.0,
+        )
 
     first = round_of(named["cogging", "elbow_joint"], 2100.0, 100.0, 1885.0)
     second = round_of(named["transmission_error", "elbow_joint"], 100.0 if left else 500.0, left, periods)
@@ -250,7 +268,10 @@ def test_a_weak_ripple_at_a_multiple_of_the_periods_of_another_is_its_overtone(n
 def test_what_is_left_is_a_share_of_the_excess_over_noise():
     first, near, far = (SimpleNamespace(chi2_per_dof=x) for x in (9488.0, 7.2, 400.0))
     assert left_share(first, near) < LEFT_TO_DECOYS < left_share(first, far)
-    assert left_share(first, first) == pytest.approx(1.0, abs=1e-4) and left_share(first, SimpleNamespace(chi2_per_dof=1.05)) == 0.0
+    assert (
+        left_share(first, first) == pytest.approx(1.0, abs=1e-4)
+        and left_share(first, SimpleNamespace(chi2_per_dof=1.05)) == 0.0
+    )
 
 
 def test_an_encoder_that_is_off_its_centre_errs_by_the_true_angle(identified):
@@ -301,7 +322,8 @@ def test_signals_summed_line_by_line_are_those_of_whole_torques(identified, chan
 
 @pytest.mark.parametrize("channel, value", [("spring", 1e-4), ("link", 1.0), ("position", 1e-4)])
 def test_a_unit_response_holds_what_the_arm_does_where_it_comes_to_stand(identified, named, channel, value):
-    """A gear that always carries its load one way stands elsewhere by half of its dead band, and there the arm is another.
+    """A gear that always carries its load one way stands elsewhere by half of its dead band, and there the arm is
+    another.
 
     So it does under a constant torque on its link, and where its encoder is off by a constant angle.
     """
@@ -309,17 +331,29 @@ def test_a_unit_response_holds_what_the_arm_does_where_it_comes_to_stand(identif
     problem, h = setup.problem, named["backlash", "elbow_joint"]
     if channel != "spring":
         constant = torque_offset(h.joint, h.place)
-        h = replace(constant, channel=channel, law=lambda p, m, j, k: m.lines(constant.law(p, m, j, k)) if channel == "position" else constant.law(p, m, j, k))
+        h = replace(
+            constant,
+            channel=channel,
+            law=lambda p, m, j, k: (
+                m.lines(constant.law(p, m, j, k)) if channel == "position" else constant.law(p, m, j, k)
+            ),
+        )
     p = np.array([value, *np.zeros(len(h.parameters) - 1)])
     preds = predictions(problem, result.model, result.remainders, steps=8)
     moved = predictions(problem, replace(result.model, effects=(Effect(h, p),)), result.remainders, steps=8)
     for group, a, b in zip(problem.groups, preds, moved, strict=True):
         delta = a.motion(group).delta(h.joint)
         assert np.all(np.sign(delta) == np.sign(delta[0, 0]))  # the gear stays on one flank
-        X = value * _lines(a.motion(group), h.screen(a.motion(group), h.joint, a.par.stiffness[h.joint], ()).signals)[..., 0]
+        X = (
+            value
+            * _lines(a.motion(group), h.screen(a.motion(group), h.joint, a.par.stiffness[h.joint], ()).signals)[..., 0]
+        )
         along = _gain(a, h.channel, h.joint) * X[..., None]
         way = moved_by_gears(a) @ _share_of_gears(a, h.channel, h.joint) * X[:, :1, None].real
-        held, whole = (np.linalg.norm((x - b.outputs(group) + a.outputs(group))[:, 1 : group.n_compared]) for x in (along, along + way))
+        held, whole = (
+            np.linalg.norm((x - b.outputs(group) + a.outputs(group))[:, 1 : group.n_compared])
+            for x in (along, along + way)
+        )
         assert whole < 0.1 * held
 
 
@@ -341,12 +375,16 @@ def test_a_softer_gear_lets_the_arm_sag_in_the_columns_of_the_drives(identified,
 
 
 @pytest.mark.parametrize(("law", "size"), [("hardening_stiffness", 0.3), ("backlash", 0.3)])
-def test_beside_a_law_of_the_gear_the_column_of_its_spring_knows_where_the_arm_sags(identified, named, monkeypatch, law, size):
+def test_beside_a_law_of_the_gear_the_column_of_its_spring_knows_where_the_arm_sags(
+    identified, named, monkeypatch, law, size
+):
     """Of small motion, at which the law and the geometry are the same in all lines."""
     monkeypatch.setattr("ident.inverse.NEAR_CHANGE", 1e-9)
     _, setup, result = identified
     problem, h, model = setup.problem, named[law, "elbow_joint"], result.model
-    small = replace(problem.groups[0], Q=np.concatenate([problem.groups[0].Q[:, :1], 0.01 * problem.groups[0].Q[:, 1:]], axis=1))
+    small = replace(
+        problem.groups[0], Q=np.concatenate([problem.groups[0].Q[:, :1], 0.01 * problem.groups[0].Q[:, 1:]], axis=1)
+    )
     problem = replace(problem, groups=(small,))
 
     def predicted(m, W):
@@ -356,7 +394,9 @@ def test_beside_a_law_of_the_gear_the_column_of_its_spring_knows_where_the_arm_s
     p = size * (model.par.stiffness[2] / sag**2 if law == "hardening_stiffness" else sag)
     model = replace(model, effects=(Effect(h, np.array([p, *np.zeros(len(h.parameters) - 1)])),))
     here, x = predicted(model, None), pack(model)
-    ends = [predicted(unpack(model, x + step * (np.arange(len(x)) == 2), np.inf), here.solution.W) for step in (1e-2, -1e-2)]
+    ends = [
+        predicted(unpack(model, x + step * (np.arange(len(x)) == 2), np.inf), here.solution.W) for step in (1e-2, -1e-2)
+    ]
     slope = (ends[0].U - ends[1].U)[:, 1 : small.n_compared] / 2e-2
     column = jacobian(problem, model, small, here, shifts=True).dense()[:, 1 : small.n_compared, :, 2]
     excited = small.excited[:, 1 : small.n_compared].any(axis=0)
@@ -422,14 +462,22 @@ def test_a_hinge_is_the_same_from_the_nearest_axis(named, place, tilts):
     p = np.array([5e4, 30.0, *tilts[: len(h.parameters) - 2]])
     there = turned(Effect(h, p))
     (a,), (b,) = (x.hypothesis.options["change"](x.p).elasticities for x in (Effect(h, p), there))
-    assert np.abs(np.dot(a.axis, b.axis)) == pytest.approx(1.0) and (a.stiffness, a.damping, a.before) == (b.stiffness, b.damping, b.before)
+    assert np.abs(np.dot(a.axis, b.axis)) == pytest.approx(1.0) and (a.stiffness, a.damping, a.before) == (
+        b.stiffness,
+        b.damping,
+        b.before,
+    )
     assert np.all(np.abs(there.p[2:]) <= 1.0) and turned(there) is there and there.hypothesis.key == h.key
 
 
 def test_a_hinge_is_found_across_the_axis_from_which_it_was_sought(identified):
     _, setup, result = identified
     problem = setup.problem
-    first, second = (h for h in catalogue(problem.structure) if h.key == ("transverse_elasticity", "elbow_joint") and not h.options["before"])
+    first, second = (
+        h
+        for h in catalogue(problem.structure)
+        if h.key == ("transverse_elasticity", "elbow_joint") and not h.options["before"]
+    )
     models = result.model, replace(result.model, effects=(Effect(first, np.array([2e4, 20.0, 0.05])),))
     before, after = (predictions(problem, m, [None] * len(problem.groups), steps=None) for m in models)
     problem = recorded_with(problem, before, after)
@@ -438,7 +486,9 @@ def test_a_hinge_is_found_across_the_axis_from_which_it_was_sought(identified):
     sought = explore(problem, stage, [second], 0.0, np.inf, Workers(), rough=True)[0][0][1]
     for model in (polish(problem, start).model, sought.model):
         (found,) = model.effects
-        assert np.abs(np.dot(found.hypothesis.options["axis"](found.p), first.options["axis"]([1.0, 1.0, 0.05]))) > 0.9999
+        assert (
+            np.abs(np.dot(found.hypothesis.options["axis"](found.p), first.options["axis"]([1.0, 1.0, 0.05]))) > 0.9999
+        )
         assert found.value("stiffness") == pytest.approx(2e4, rel=0.01)
 
 
@@ -460,11 +510,16 @@ def test_a_candidate_that_turned_far_goes_on_before_it_is_compared(identified, n
 
 @pytest.mark.slow
 def test_a_step_that_is_cut_to_lead_uphill_does_not_end_a_fit(ur10, named):
-    """Beside a loop, of a hinge that is begun too stiff and turned: parts of the step are cut, and what is left rises."""
+    """Beside a loop, of a hinge that is begun too stiff and turned: parts of the step are cut, and what is left
+    rises."""
     plan = small_plan(ur10, 1, points=1, levels=(1.0,), validation_points=0)
     setup, result = identify(run_experiment(plan, [], seed=1, timestep=5e-4))
     problem = setup.problem
-    hinge = next(h for h in catalogue(problem.structure) if h.key == ("transverse_elasticity", "elbow_joint") and not h.options["before"])
+    hinge = next(
+        h
+        for h in catalogue(problem.structure)
+        if h.key == ("transverse_elasticity", "elbow_joint") and not h.options["before"]
+    )
     slip = Effect(named["hysteresis", "shoulder_pan_joint"], np.array([5e3, 1.0, 10.0, 0.0, 0.0]))
     true = replace(result.model, effects=(slip, Effect(hinge, np.array([5e4, 30.0, 0.0]))))
     before, after = (predictions(problem, m, [None] * len(problem.groups), steps=None) for m in (result.model, true))
@@ -506,12 +561,15 @@ def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise,
 
 
 def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():
-    """Where all joints leave no more than noise, a joint of 1.15 times it is none that a cause should have explained."""
+    """Where all joints leave no more than noise, a joint of 1.15 times it is none that a cause should have
+    explained."""
     from ident.attribute import Attribution
     from ident.trust import left_of
 
     def fit(*chi2):
-        return SimpleNamespace(costs=1e3 * np.array(chi2), counts=np.full(len(chi2), 1e3), chi2_per_dof=float(np.mean(chi2)))
+        return SimpleNamespace(
+            costs=1e3 * np.array(chi2), counts=np.full(len(chi2), 1e3), chi2_per_dof=float(np.mean(chi2))
+        )
 
     chain, own = (SimpleNamespace(on_chain=x, joint=1) for x in (True, False))
     faint = Attribution(fit(1.02, 1.05, 1.15), True, 0.0, (), fit(1.0, 1.0, 1.15), False)
@@ -531,8 +589,16 @@ def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():
             False,
             "The simulation misses something that these data do not tell for sure: torque lag at b (50%) or backlash at a (48%).",
         ),
-        ([("backlash", 0.4, 0.0)], False, "The simulation misses something that these data do not tell for sure: backlash at a (40%)."),
-        ([("backlash", 0.4, 0.0)], True, "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."),
+        (
+            [("backlash", 0.4, 0.0)],
+            False,
+            "The simulation misses something that these data do not tell for sure: backlash at a (40%).",
+        ),
+        (
+            [("backlash", 0.4, 0.0)],
+            True,
+            "The simulation misses something that no effect of the catalogue explains: an unknown cause remains.",
+        ),
         (
             [("cogging", 0.99, 0.0), ("backlash", 0.4, 0.3)],
             False,
@@ -555,7 +621,9 @@ def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
     bad = replace(baseline, costs=10.0 * baseline.costs)
     moved = baseline.model.par.stiffness * np.array([1, 1, 0.1, 1, 1, 1])
     spoilt = replace(bad, model=replace(bad.model, par=replace(bad.model.par, stiffness=moved)))
-    stiff = replace(bad, model=replace(bad.model, par=replace(bad.model.par, stiffness=100.0 * baseline.model.par.stiffness)))
+    stiff = replace(
+        bad, model=replace(bad.model, par=replace(bad.model.par, stiffness=100.0 * baseline.model.par.stiffness))
+    )
     unseen = replace(stiff, information=1e-12 * stiff.information)
     assert not collapsed(setup.problem, bad)
     assert collapsed(setup.problem, spoilt) and collapsed(setup.problem, stiff)
@@ -581,10 +649,14 @@ def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
 def test_a_limit_far_below_the_peaks_is_one_that_a_loop_winds_up_against(wound_up, limit):
     """In motions that exceed it now and then; elsewhere it would explain any motor that friction holds."""
     h, u = torque_saturation(2, "elbow_joint", wound_up), 20.0 * np.linspace(-2.0, 2.0, 401)
-    motion = SimpleNamespace(torque=lambda j: u, peak_torque=lambda j: 40.0, usual_torque=lambda j: 3.0, lines=lambda x: x)
+    motion = SimpleNamespace(
+        torque=lambda j: u, peak_torque=lambda j: 40.0, usual_torque=lambda j: 3.0, lines=lambda x: x
+    )
     taken = h.law(np.array([1.0, 2e-3]), motion, 2, 1.0, 0.0)
     assert np.abs(u - taken).max() == pytest.approx(limit, rel=1e-2)
-    starts = [[x for x, _ in h.shapes(SimpleNamespace(peak_torque=40.0, exceeded_torque=low))] for low in (5.0, 11.0, np.inf)]
+    starts = [
+        [x for x, _ in h.shapes(SimpleNamespace(peak_torque=40.0, exceeded_torque=low))] for low in (5.0, 11.0, np.inf)
+    ]
     assert starts == ([[5.0, 7.0], [], []] if wound_up else [[20.0, 26.0, 32.0, 36.0, 38.4]] * 3)
 
 
@@ -600,7 +672,9 @@ def test_a_motor_that_creeps_in_its_friction_is_no_drive_that_saturates(tmp_path
 
 def test_a_motor_that_friction_holds_altogether_is_said_not_to_move(tmp_path):
     robot = load_robot("twomass")
-    data = run_experiment(small_plan(robot, 4, period=1000), [parse_effect("coulomb_friction@drive:torque=0.3", robot)], seed=4)
+    data = run_experiment(
+        small_plan(robot, 4, period=1000), [parse_effect("coulomb_friction@drive:torque=0.3", robot)], seed=4
+    )
     with pytest.raises(DataError, match="no joint that moves"):
         diagnose(through_files(data, tmp_path))
 
@@ -637,15 +711,20 @@ def test_a_gear_far_from_its_guess_has_gone_astray(identified):
     assert list(np.flatnonzero(astray(setup.problem, moved))) == [3]
 
 
-@pytest.mark.parametrize("interval, bad", [((-2.0, -0.1), True), ((-1.0, 0.3), False), ((0.8, 1.0), False), (None, False)])
+@pytest.mark.parametrize(
+    "interval, bad", [((-2.0, -0.1), True), ((-1.0, 0.3), False), ((0.8, 1.0), False), (None, False)]
+)
 def test_an_extension_that_surely_harms_is_taken_back(interval, bad):
     assert harmful(Gain(("a", "b"), "rms", 1.0, 1.5, 0.1, -0.5, interval, "validation segments")) == bad
     assert not harmful(None)
 
 
-@pytest.mark.parametrize("effect, start", [("coulomb_friction", (1e-5, 0.0, 1e-3)), ("cogging", (1e-3, 101.0, 1e-3, 0.0, 0.0))])
+@pytest.mark.parametrize(
+    "effect, start", [("coulomb_friction", (1e-5, 0.0, 1e-3)), ("cogging", (1e-3, 101.0, 1e-3, 0.0, 0.0))]
+)
 def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified, named, effect, start):
-    """The data hold no effect: a friction that was let in stands for nothing, and so does a ripple of whatever period."""
+    """The data hold no effect: a friction that was let in stands for nothing, and so does a ripple of whatever
+    period."""
     _, setup, result = identified
     model = replace(result.model, effects=(Effect(named[effect, "elbow_joint"], np.array(start)),))
     found = pruned(setup.problem, polish(setup.problem, replace(result, model=model)))
@@ -659,7 +738,8 @@ def scaled(weights, factor):
 
 
 def test_noise_under_other_weights_is_that_of_its_draws(identified):
-    """The closed form against draws of the noise, which is correlated between joints, under weights of another model."""
+    """The closed form against draws of the noise, which is correlated between joints, under weights of another
+    model."""
     _, setup, result = identified
     problem, rng = setup.problem, np.random.default_rng(3)
     nominal = predictions(problem, replace(result.model, par=problem.nominal), result.remainders)
@@ -670,7 +750,9 @@ def test_noise_under_other_weights_is_that_of_its_draws(identified):
     for g, group in enumerate(problem.groups):
         root = np.linalg.cholesky(own.covariance[g])
         for _ in range(200):
-            white = rng.normal(size=(len(group.segments), *root.shape[:2])) + 1j * rng.normal(size=(len(group.segments), *root.shape[:2]))
+            white = rng.normal(size=(len(group.segments), *root.shape[:2])) + 1j * rng.normal(
+                size=(len(group.segments), *root.shape[:2])
+            )
             noise = np.matmul(root, white[..., None])[..., 0]
             for i, weights in enumerate((own, other)):
                 drawn[i] += np.sum(np.abs(weights.apply(g, noise)) ** 2, axis=(0, 1))[: problem.structure.n]
@@ -685,7 +767,9 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     preds = predictions(problem, rub, result.remainders)
     wrong = replace(result, model=rub, costs=joint_costs(problem, preds, result.weights))
     loud = scaled(result.weights, 10.0)
-    flattered = replace(result, weights=loud, costs=joint_costs(problem, predictions(problem, result.model, result.remainders), loud))
+    flattered = replace(
+        result, weights=loud, costs=joint_costs(problem, predictions(problem, result.model, result.remainders), loud)
+    )
     assert wrong.costs[joint] > 2.0 * wrong.counts[joint] > flattered.costs[joint]
     assert matched(problem, joint, flattered, [wrong, result])
     assert not matched(problem, joint, flattered, [wrong]) and not matched(problem, joint, flattered, [])
@@ -700,7 +784,8 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
 
 
 def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(identified, named):
-    """The record tells any law of the gear much; one that is right as a loop too is preferred where it is no worse along it."""
+    """The record tells any law of the gear much; one that is right as a loop too is preferred where it is no worse
+    along it."""
     _, setup, result = identified
     problem = setup.problem
     own = Effect(named["hardening_stiffness", "elbow_joint"], np.array([1.0]))
@@ -716,7 +801,8 @@ def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(ide
 
 
 def test_no_strong_effect_is_sought_where_a_cause_has_left_next_to_nothing(identified, named):
-    """Half a per cent of what a cause explains is an error of its law; two per cent may be another cause; its joint alone, where others leave much."""
+    """Half a per cent of what a cause explains is an error of its law; two per cent may be another cause; its joint
+    alone, where others leave much."""
     _, setup, result = identified
     problem, j = setup.problem, 2
     h = named["coulomb_friction", "elbow_joint"]
@@ -742,17 +828,26 @@ def test_no_strong_effect_is_sought_where_a_cause_has_left_next_to_nothing(ident
 
 @pytest.mark.parametrize(
     "effect, left, much",
-    [("coulomb_friction", 0.005, False), ("coulomb_friction", 0.02, True), ("backlash", 0.005, True), ("backlash", 0.0, False)],
+    [
+        ("coulomb_friction", 0.005, False),
+        ("coulomb_friction", 0.02, True),
+        ("backlash", 0.005, True),
+        ("backlash", 0.0, False),
+    ],
 )
 def test_errors_of_a_law_ask_for_no_strong_effect(identified, named, effect, left, much):
-    """Unless the law is one under which the arm may have several steady motions: another of them may be the right one."""
+    """Unless the law is one under which the arm may have several steady motions: another of them may be the right
+    one."""
     _, setup, result = identified
     excess = 1e4 * result.counts
     before, after = (replace(result, costs=result.counts + x * excess) for x in (1.0, left))
     assert leaves_much(setup.problem, before, [(named[effect, "elbow_joint"], after)]) == much
 
 
-@pytest.mark.parametrize(("at_joint", "told", "expected"), [(0.0, 0.0, False), (0.24, 0.0, False), (0.8, 0.0, True), (0.8, 1e3, True), (0.8, 1e5, False)])
+@pytest.mark.parametrize(
+    ("at_joint", "told", "expected"),
+    [(0.0, 0.0, False), (0.24, 0.0, False), (0.8, 0.0, True), (0.8, 1e3, True), (0.8, 1e5, False)],
+)
 def test_one_joint_alone_may_be_loud(identified, at_joint, told, expected):
     """What all joints together would hide; not what a hundredth of an error in the law of a cause there leaves."""
     result = identified[-1]
@@ -788,7 +883,9 @@ def test_where_a_linear_step_tells_the_rest_no_strong_effect_is_sought(identifie
 def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identified):
     _, setup, result = identified
     problem = setup.problem
-    scores = screen(problem, result, predictions(problem, result.model, result.remainders), catalogue(problem.structure))
+    scores = screen(
+        problem, result, predictions(problem, result.model, result.remainders), catalogue(problem.structure)
+    )
     stage = replace(result, costs=result.counts * np.array([1.0, 3.0, 9.0, 1.0, 1.0, 1.0]))
 
     def joints(likely: int, quiet: set[int]) -> set[int]:
@@ -822,12 +919,21 @@ def test_what_a_law_leaves_at_its_joint_asks_for_no_hinge(identified, named, mon
     monkeypatch.setattr("ident.search.refit", lambda problem, model, *args: replace(stage, model=model, converged=True))
     monkeypatch.setattr("ident.search.hinges_everywhere", lambda *args: told.append(args) or [])
     for quiet, asked in (((), 1), ((2,), 1), ((3,), 2)):  # how often so far
-        explore(setup.problem, stage, [named["unknown:drag_2", "elbow_joint"]], 0.0, np.inf, Workers(), quiet=frozenset(quiet))
+        explore(
+            setup.problem,
+            stage,
+            [named["unknown:drag_2", "elbow_joint"]],
+            0.0,
+            np.inf,
+            Workers(),
+            quiet=frozenset(quiet),
+        )
         assert len(told) == asked
 
 
 def test_a_search_seeks_no_strong_effect_at_quiet_joints(identified, monkeypatch):
-    """From the rounds before to the fits: what is quiet is asked of the model as it is, and left out of what is fitted."""
+    """From the rounds before to the fits: what is quiet is asked of the model as it is, and left out of what is
+    fitted."""
     _, setup, result = identified
     problem, told, given = setup.problem, [], []
 
@@ -835,12 +941,19 @@ def test_a_search_seeks_no_strong_effect_at_quiet_joints(identified, monkeypatch
         raise ArithmeticError
 
     monkeypatch.setattr("ident.strong.anneal", lost)
-    scores = screen(problem, result, predictions(problem, result.model, result.remainders), catalogue(problem.structure))
+    scores = screen(
+        problem, result, predictions(problem, result.model, result.remainders), catalogue(problem.structure)
+    )
     for quiet in (range(6), ()):
-        assert beside_strong(problem, result, [], scores, Workers(progress=told.append), frozenset(quiet)) == (result, [])
+        assert beside_strong(problem, result, [], scores, Workers(progress=told.append), frozenset(quiet)) == (
+            result,
+            [],
+        )
         assert bool(told) != bool(quiet)
     monkeypatch.setattr("ident.attribute.shadows", lambda *args: frozenset({3}))
-    monkeypatch.setattr("ident.attribute.attribute_once", lambda *args: given.append(args[-1]) or Round(result, (), (), 1.0, 0.0))
+    monkeypatch.setattr(
+        "ident.attribute.attribute_once", lambda *args: given.append(args[-1]) or Round(result, (), (), 1.0, 0.0)
+    )
     attribute(problem, replace(result, costs=10.0 * result.counts))
     assert given == [frozenset({3})]
 
@@ -849,7 +962,10 @@ def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
     """Two of an effect are refitted; the inertia of links one behind the other is hardly told by linear steps."""
     names = ("forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link")
     gains = (1.0, 0.99, 0.9, 0.1)
-    scores = [SimpleNamespace(hypothesis=named["link_inertia", k], gain=g, start=np.ones(5)) for k, g in zip(names, gains, strict=True)]
+    scores = [
+        SimpleNamespace(hypothesis=named["link_inertia", k], gain=g, start=np.ones(5))
+        for k, g in zip(names, gains, strict=True)
+    ]
     rub = SimpleNamespace(hypothesis=named["coulomb_friction", "elbow_joint"], gain=0.95, start=np.ones(3))
     scores.insert(2, rub)
     tried = choose(scores)
@@ -862,7 +978,16 @@ def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
 
 def test_decoys_take_no_place_of_a_named_one(named):
     joints = ("shoulder_pan_joint", "elbow_joint")
-    effects = ("unknown:drag_2", "unknown:drag_3", "unknown:rising_friction", "coulomb_friction", "torque_lag", "cogging", "torque_constant", "backlash")
+    effects = (
+        "unknown:drag_2",
+        "unknown:drag_3",
+        "unknown:rising_friction",
+        "coulomb_friction",
+        "torque_lag",
+        "cogging",
+        "torque_constant",
+        "backlash",
+    )
     laws = [named[effect, joint] for effect in effects for joint in joints]
     scores = [SimpleNamespace(hypothesis=h, gain=1.0 - 0.01 * i, start=np.ones(3)) for i, h in enumerate(laws)]
     chosen = [s.hypothesis for s in choose(scores)]
@@ -876,7 +1001,12 @@ def test_decoys_take_no_place_of_a_named_one(named):
 def test_a_cause_meets_those_that_are_hard_to_tell_from_it_though_its_round_has_not_tried_them(named):
     heavy, scale = named["link_inertia", "forearm_link"], named["torque_constant", "elbow_joint"]
     assert heavy.joint == scale.joint
-    others = [named["torque_constant", "wrist_1_joint"], named["cogging", "elbow_joint"], scale, named["torque_lag", "elbow_joint"]]
+    others = [
+        named["torque_constant", "wrist_1_joint"],
+        named["cogging", "elbow_joint"],
+        scale,
+        named["torque_lag", "elbow_joint"],
+    ]
     scores = tuple(SimpleNamespace(hypothesis=h, start=np.array([1.1])) for h in others)
     found = Round(None, (Candidate(heavy, None, 0.0, 1.0),), scores, 1.0, 1.0)
     (twin,) = alike(found, heavy)
@@ -918,7 +1048,12 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     quiet = Attribution(result, False, 1e-14, (), result, False)
     assert any("p = 1e-14" in note for note in conclude(data, problem, (), result, quiet, None, preds, preds).notes)
     h = named["hysteresis", "elbow_joint"]
-    final = refit(problem, replace(result.model, effects=(Effect(h, np.array([1e3, 1e4, 5.0, 0.0, 0.0])),)), result.weights, result.remainders)
+    final = refit(
+        problem,
+        replace(result.model, effects=(Effect(h, np.array([1e3, 1e4, 5.0, 0.0, 0.0])),)),
+        result.weights,
+        result.remainders,
+    )
     worse = replace(result, costs=1e3 * result.costs)
     found = Round(worse, (Candidate(h, final, 0.0, 1.0),), (), 1.0, 1.0)
     heard = Attribution(worse, True, 0.0, (found,), final, False)
@@ -946,7 +1081,8 @@ def test_a_hysteresis_of_which_no_yielding_is_seen_is_not_trusted(named, std, tr
 
 @pytest.mark.parametrize(("off", "trusted"), [(0.5, False), (2.0, True)])
 def test_a_body_is_another_only_where_its_figures_together_say_so(named, off, trusted):
-    """Each of five figures at most two deviations from that of the model, two of which would go together by chance and do not."""
+    """Each of five figures at most two deviations from that of the model, two of which would go together by chance and
+    do not."""
     body = named["link_inertia", "forearm_link"]
     std = np.array([0.02, 0.01, 0.01, 0.01, 0.05])
     covariance = np.diag(std**2)
@@ -957,7 +1093,8 @@ def test_a_body_is_another_only_where_its_figures_together_say_so(named, off, tr
 
 
 def test_what_is_no_chance_and_yet_no_discrepancy_is_said():
-    """A tiny p-value beside ``detected: false`` is explained; none is needed where the model leaves noise, or causes were sought."""
+    """A tiny p-value beside ``detected: false`` is explained; none is needed where the model leaves noise, or causes
+    were sought."""
     left = SimpleNamespace(chi2_per_dof=1.07)
 
     def notes(detected: bool, p_value: float) -> tuple[str, ...]:
@@ -973,7 +1110,9 @@ def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identifi
     _, setup, result = identified
     problem, rub, payload = setup.problem, named["coulomb_friction", "elbow_joint"], named["payload", "flange"]
     decoy = next(h for h in named.values() if h.decoy and h.joint == rub.joint)
-    clear, faint = (replace(result, costs=result.costs + off * result.counts * (np.arange(6) == rub.joint)) for off in (9.0, 1.5))
+    clear, faint = (
+        replace(result, costs=result.costs + off * result.counts * (np.arange(6) == rub.joint)) for off in (9.0, 1.5)
+    )
 
     def with_friction(torque):
         return replace(result, model=replace(result.model, effects=(Effect(rub, np.array([torque, 0.0, 1e-3])),)))
@@ -989,7 +1128,9 @@ def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identifi
 def test_a_start_that_loses_the_data_is_not_followed(identified, named):
     _, setup, result = identified
     rub = named["coulomb_friction", "elbow_joint"]
-    small, large, none = (replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3])),)) for t in (1e-3, 50.0, np.nan))
+    small, large, none = (
+        replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3])),)) for t in (1e-3, 50.0, np.nan)
+    )
 
     def followed(model):
         return refit(setup.problem, model, result.weights, result.remainders, 1, STRONG * result.count)
@@ -1041,7 +1182,9 @@ def test_an_effect_that_the_data_need_stays_and_a_companion_that_they_do_not_goe
     of = {h.key: h for h in catalogue(setup.problem.structure)}
     slip = Effect(of["presliding_friction", "wrist_2_joint"], np.array([500.0, 0.02, 1.0, 0.0]))
     both = polish(setup.problem, replace(fitted, model=replace(fitted.model, effects=(*fitted.model.effects, slip))))
-    frictions = [SimpleNamespace(before=result, candidates=(Candidate(h, None, 0.0, 1.0),)) for h in (rub, slip.hypothesis)]
+    frictions = [
+        SimpleNamespace(before=result, candidates=(Candidate(h, None, 0.0, 1.0),)) for h in (rub, slip.hypothesis)
+    ]
     later = SimpleNamespace(before=both, candidates=(Candidate(of["cogging", "wrist_3_joint"], None, 0.0, 1.0),))
     assert without_shadows(setup.problem, both, frictions, Workers()) is both
     left = without_shadows(setup.problem, both, [*frictions, later], Workers())
@@ -1053,7 +1196,11 @@ def test_a_coordinate_that_the_data_do_not_feel_has_a_large_deviation():
     B = np.array([[1e6, 2.0, 0.0], [0.0, 1e-3, 0.0], [3.0, 0.0, 0.0]])
     H = B.T @ B
     C = inverse(H, RIDGE)
-    assert np.allclose(C[:2, :2] * np.outer([1e6, 1e-3], [1e6, 1e-3]), np.linalg.inv(H[:2, :2]) * np.outer([1e6, 1e-3], [1e6, 1e-3]), rtol=1e-3)
+    assert np.allclose(
+        C[:2, :2] * np.outer([1e6, 1e-3], [1e6, 1e-3]),
+        np.linalg.inv(H[:2, :2]) * np.outer([1e6, 1e-3], [1e6, 1e-3]),
+        rtol=1e-3,
+    )
     assert C[2, 2] > 1e12
 
 
@@ -1071,15 +1218,23 @@ def test_ripples_are_named_at_one_joint_after_another(named):
     assert companions(None, untouched, ripple, tuple(named.values())) == (untouched, [])
 
 
-@pytest.mark.parametrize(("along", "costs", "expected"), [
-    (False, [1.0, 1.0], True), (False, [1.0, 1.4], False), (True, [0.6, 1.5], True), (True, [0.5, 3.0], False),
-])
+@pytest.mark.parametrize(
+    ("along", "costs", "expected"),
+    [
+        (False, [1.0, 1.0], True),
+        (False, [1.0, 1.4], False),
+        (True, [0.6, 1.5], True),
+        (True, [0.5, 3.0], False),
+    ],
+)
 def test_a_law_along_the_record_is_settled_where_no_joint_shows_more(named, along, costs, expected):
     """Its noise is taken large for all joints: on average two may be at the noise, and one of them far from it."""
     h = named["hardening_stiffness", "elbow_joint"]
     model = SimpleNamespace(effects=(Effect(along_record(h) if along else h, np.array([1e8])),))
     counts = np.array([1000.0, 1000.0])
-    left = SimpleNamespace(model=model, costs=np.array(costs) * counts, counts=counts, chi2_per_dof=float(np.mean(costs)))
+    left = SimpleNamespace(
+        model=model, costs=np.array(costs) * counts, counts=counts, chi2_per_dof=float(np.mean(costs))
+    )
     assert settled(left) is expected
 
 
@@ -1106,14 +1261,17 @@ def test_drives_gone_astray_have_no_noise_of_their_own(identified):
 
 @pytest.mark.parametrize(("unit", "spread"), [("rad", 1e-4), ("1", 0.2 / np.sqrt(12.0))])
 def test_bounds_say_how_large_a_pure_number_may_be_and_no_other(unit, spread):
-    """Those of an amplitude keep it finite: charged for them a small eccentricity of an encoder had lost against a link's inertia."""
+    """Those of an amplitude keep it finite: charged for them a small eccentricity of an encoder had lost against a
+    link's inertia."""
     q = Parameter("sine", unit, -0.1, 0.1)
     assert q.expected_spread(-1e-4) == pytest.approx(spread)
     assert q.bounded == (unit == "1")
 
 
 @pytest.mark.parametrize(("left", "fitted"), [(0.99, 1), (0.5, 2)])
-def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no_further(identified, monkeypatch, left, fitted):
+def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no_further(
+    identified, monkeypatch, left, fitted
+):
     _, setup, baseline = identified
     h = next(h for h in catalogue(setup.problem.structure) if h.key == ("torque_delay", "elbow_joint"))
     loud = replace(baseline, costs=10.0 * baseline.counts)
@@ -1121,7 +1279,9 @@ def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no
 
     def once(problem, model, weights, remainders, iterations=10, most=np.inf):
         steps.append(iterations)
-        return replace(loud, model=model, costs=baseline.counts + left * (loud.costs - baseline.counts), converged=False)
+        return replace(
+            loud, model=model, costs=baseline.counts + left * (loud.costs - baseline.counts), converged=False
+        )
 
     score = Score(h, 1e9, 1, np.array([1e-3]), np.ones(1), ())
     monkeypatch.setattr("ident.search.screen", lambda *args: [score])
@@ -1131,7 +1291,8 @@ def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no
 
 
 def test_a_ripple_is_begun_at_all_wave_numbers_that_explain_nearly_as_much(identified, monkeypatch):
-    """The one that leaves least after the first steps is fitted further, though another explained more in a linear step."""
+    """The one that leaves least after the first steps is fitted further, though another explained more in a linear
+    step."""
     _, setup, baseline = identified
     h = next(h for h in catalogue(setup.problem.structure) if h.key == ("cogging", "elbow_joint"))
     loud = replace(baseline, costs=10.0 * baseline.counts)
@@ -1200,7 +1361,10 @@ def test_the_cause_between_two_joints_names_both(identified, named):
     tried.append(Candidate(by_joints["wrist_1_joint", "wrist_3_joint"], final, 0.0, 0.1))
     tried.append(Candidate(named["torque_delay", "wrist_1_joint"], rival, 0.0, 0.2))
     told = _cause(final.model.effects[0], tried, final, final.covariance(), 1.0)
-    assert told.probability == pytest.approx(0.7) and [a.effect for a in told.alternatives] == ["torque_delay", "joint_coupling"]
+    assert told.probability == pytest.approx(0.7) and [a.effect for a in told.alternatives] == [
+        "torque_delay",
+        "joint_coupling",
+    ]
     assert cause.joint == "wrist_1_joint" and cause.joints == ("wrist_1_joint", "wrist_2_joint")
     assert "wrist_1_joint turns wrist_2_joint too" in cause.evidence
 
@@ -1218,7 +1382,9 @@ def test_a_cause_of_the_whole_arm_is_shown_at_one_joint():
 def test_what_is_left_is_compared_joint_by_joint():
     counts = np.full(3, 100.0)
     # One joint far above the others says no more than these.
-    rough, better = (SimpleNamespace(costs=np.array(x) * counts, counts=counts) for x in ([1e4, 8.0, 0.5], [1e4, 1.0, 0.9]))
+    rough, better = (
+        SimpleNamespace(costs=np.array(x) * counts, counts=counts) for x in ([1e4, 8.0, 0.5], [1e4, 1.0, 0.9])
+    )
     assert left_over(better, rough) == pytest.approx(0.5) and left_over(rough, better) == pytest.approx(2.0)
 
 
@@ -1231,16 +1397,21 @@ def test_a_load_is_the_change_of_its_body(ur10):
     assert payload_like(link, loaded, bare) is None
 
 
-@pytest.mark.parametrize(("costs", "kept"), [((1000.0, 1095.0, 1105.0), 2), ((1200.0, 1700.0, 1900.0), 2), ((9000.0, 1000.0, 1020.0), 3)])
+@pytest.mark.parametrize(
+    ("costs", "kept"), [((1000.0, 1095.0, 1105.0), 2), ((1200.0, 1700.0, 1900.0), 2), ((9000.0, 1000.0, 1020.0), 3)]
+)
 def test_rivals_far_behind_leave_a_contest_and_the_cause_itself_stays(costs, kept):
-    """Of a best one at the noise those within its error of 1,000 data are in reach; else those that leave up to four times as much."""
+    """Of a best one at the noise those within its error of 1,000 data are in reach; else those that leave up to four
+    times as much."""
     ran = [Candidate(None, SimpleNamespace(cost=c, count=1000), 0.0) for c in costs]
     assert in_reach(ran) == ran[:kept]
 
 
 def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named):
     _, setup, result = identified
-    model = replace(result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2, 0.0])),))
+    model = replace(
+        result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2, 0.0])),)
+    )
     fitted = refit(setup.problem, model, result.weights, result.remainders, 1)
     cable = Candidate(fitted.model.effects[-1].hypothesis, fitted, 0.0)
     spring = named["gravity_spring", "elbow_joint"].key
@@ -1251,5 +1422,8 @@ def test_a_body_with_its_load_and_without_stay_in_a_contest():
     """Fits that are as good to noise ask for changes of which one may be far simpler."""
     bare, loaded = (link_inertia("wrist_3_link", 5, True, with_load) for with_load in (False, True))
     load = payload("wrist_3_link")
-    ran = [Candidate(h, SimpleNamespace(cost=c), 0.0) for h, c in ((bare, 10.2), (bare, 10.1), (loaded, 10.0), (load, 10.3), (load, 12.0))]
+    ran = [
+        Candidate(h, SimpleNamespace(cost=c), 0.0)
+        for h, c in ((bare, 10.2), (bare, 10.1), (loaded, 10.0), (load, 10.3), (load, 12.0))
+    ]
     assert [(c.hypothesis, c.fit.cost) for c in best_of_each(ran)] == [(loaded, 10.0), (bare, 10.1), (load, 10.3)]

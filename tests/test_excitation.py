@@ -40,7 +40,9 @@ def test_many_draws_lower_the_crest_factor():
     lines = np.arange(1, 200, 2)
     amplitudes = np.ones((len(lines), 6))
     few = [crest_factor(orthogonal_multisines(np.random.default_rng(s), lines, amplitudes, 1000, 6)) for s in range(8)]
-    many = [crest_factor(orthogonal_multisines(np.random.default_rng(s), lines, amplitudes, 1000, 120)) for s in range(8)]
+    many = [
+        crest_factor(orthogonal_multisines(np.random.default_rng(s), lines, amplitudes, 1000, 120)) for s in range(8)
+    ]
     assert np.mean(many) < np.mean(few) - 0.2
 
 

@@ -27,7 +27,8 @@ def exported(robot, *causes):
 
 
 def forced(model, data, q, v):
-    """Forces of the elements of a motor (T,) whose state is set to ``q``, ``v`` (T,), step by step; gear and damper taken off."""
+    """Forces of the elements of a motor (T,) whose state is set to ``q``, ``v`` (T,), step by step; gear and damper
+    taken off."""
     j, k = model.joint(f"motor:{JOINT}").dofadr[0], model.joint(f"link:{JOINT}").dofadr[0]
     model.tendon_stiffness[0], model.tendon_damping[0], model.dof_damping[j] = 0.0, 0.0, 0.0
     out = []
@@ -107,7 +108,9 @@ def test_hysteresis_is_maxwell_slip(bench):
 @pytest.mark.parametrize(("exponent", "recoil"), [(1.0, 0.0), (2.0, 0.5), (8.0, 0.0)])
 def test_hysteresis_that_yields_gradually_is_slips_near_to_it(bench, exponent, recoil):
     """Nearer than one slip of the same stiffness and torque, along swings far into yielding."""
-    model, data = exported(bench, cause("hysteresis", JOINT, stiffness=80.0, yield_torque=0.2, exponent=exponent, recoil=recoil))
+    model, data = exported(
+        bench, cause("hysteresis", JOINT, stiffness=80.0, yield_torque=0.2, exponent=exponent, recoil=recoil)
+    )
     _, q, v = swing(model, 0.01, 2.0)
     steps = (q - np.roll(q, 1))[None]
     law = along_path(steps, 80.0, 0.2, exponent, recoil)[0]

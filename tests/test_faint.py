@@ -1,4 +1,5 @@
-"""Effects that raise the noise of all lines by less than its estimate errs: seen by their own response, and not by chance."""
+"""Effects that raise the noise of all lines by less than its estimate errs: seen by their own response, and not by
+chance."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -46,7 +47,13 @@ def hypotheses(identified):
 def test_an_effect_within_the_error_of_the_noise_is_found(ur10, tmp_path, faint, beside):
     """Alone, and beside another one that is not faint."""
     effects = [parse_effect(text, ur10) for text in (*beside, faint)]
-    data = run_experiment(small_plan(ur10, 31, levels=(1.0,)), effects, seed=31, drives=draw_drives(np.random.default_rng(31), ur10), timestep=5e-4)
+    data = run_experiment(
+        small_plan(ur10, 31, levels=(1.0,)),
+        effects,
+        seed=31,
+        drives=draw_drives(np.random.default_rng(31), ur10),
+        timestep=5e-4,
+    )
     verdict = diagnose(through_files(data, tmp_path))
     name, value = SIZES[faint]
     sure = {(c.effect, c.joint): c for c in verdict.causes if c.probability > 0.5}
@@ -125,7 +132,8 @@ def test_nothing_faint_is_sought_beside_link_encoders(identified, hypotheses):
 
 @pytest.mark.parametrize(("size", "colour", "found"), [(0.0, 1.0, False), (0.01, 1.0, True), (0.0, 20.0, False)])
 def test_of_single_periods_phases_tell_what_noise_explains(identified, hypotheses, size, colour, found):
-    """Noise, an effect within it, and noise that rises towards the low lines of a joint, of which a few numbers explain much."""
+    """Noise, an effect within it, and noise that rises towards the low lines of a joint, of which a few numbers explain
+    much."""
     _, setup, baseline = identified
     problem, j, rng = setup.problem, 3, np.random.default_rng(2)
     few = [h for h in hypotheses if h.joint == j and not h.on_chain]
@@ -137,7 +145,9 @@ def test_of_single_periods_phases_tell_what_noise_explains(identified, hypothese
         noise = np.zeros_like(group.U)
         std = np.sqrt(problem.tau_std[j] ** 2 / problem.samples(group))
         low = 1.0 / (1.0 + (np.arange(noise.shape[1]) / 20.0) ** 2)
-        noise[..., j] = (colour - 1.0) * std * low * (rng.normal(size=noise.shape[:2]) + 1j * rng.normal(size=noise.shape[:2]))
+        noise[..., j] = (
+            (colour - 1.0) * std * low * (rng.normal(size=noise.shape[:2]) + 1j * rng.normal(size=noise.shape[:2]))
+        )
         groups.append(single(replace(group, U=group.U + after.U - before.U + noise)))
     problem = replace(problem, groups=tuple(groups))
     quiet = replace(baseline, costs=baseline.counts.astype(float))
@@ -150,17 +160,32 @@ def test_of_single_periods_phases_tell_what_noise_explains(identified, hypothese
 
 
 def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside_it_is(ur10, tmp_path):
-    """Noise that is neither given nor repeated is guessed as white, from differences of samples that hardly show coloured noise."""
+    """Noise that is neither given nor repeated is guessed as white, from differences of samples that hardly show
+    coloured noise."""
     hidden = parse_effect("payload@flange:mass=0.5,com_x=0.02,com_y=0.03,com_z=0.08", ur10)
 
     def recorded(effects, folder):
-        data = run_experiment(small_plan(ur10, 5, points=1, levels=(1.0,), periods=2, validation_points=0), effects, seed=5, noise=0.0, timestep=5e-4)
+        data = run_experiment(
+            small_plan(ur10, 5, points=1, levels=(1.0,), periods=2, validation_points=0),
+            effects,
+            seed=5,
+            noise=0.0,
+            timestep=5e-4,
+        )
         rng = np.random.default_rng(7)
 
         def coloured(x, std):
-            return x + lfilter([np.sqrt(1 - 0.6**2)], [1.0, -0.6], std * rng.normal(size=(500 + len(x), len(std))), axis=0)[500:]
+            return (
+                x
+                + lfilter([np.sqrt(1 - 0.6**2)], [1.0, -0.6], std * rng.normal(size=(500 + len(x), len(std))), axis=0)[
+                    500:
+                ]
+            )
 
-        segments = (replace(s, q=coloured(s.q, ur10.array("q_std")), tau=coloured(s.tau, ur10.array("tau_std"))) for s in data.segments)
+        segments = (
+            replace(s, q=coloured(s.q, ur10.array("q_std")), tau=coloured(s.tau, ur10.array("tau_std")))
+            for s in data.segments
+        )
         return through_files(replace(data, segments=tuple(segments), q_std=None, tau_std=None), folder)
 
     verdict = diagnose(recorded([], tmp_path / "none"), max_causes=1)
@@ -268,10 +293,17 @@ def test_faint_candidates_are_told_apart_by_what_they_explain(hypotheses):
 def test_beside_noise_alone_differences_count_for_more(hypotheses):
     """No law has an error there that neighbouring lines could share."""
     h = next(h for h in hypotheses if h.effect == "torque_delay")
-    model = SimpleNamespace(effects=(SimpleNamespace(hypothesis=h, p=np.array([1e-4])),), par=SimpleNamespace(stiffness=np.ones(6)))
-    two = [Candidate(h, SimpleNamespace(model=model, information=np.eye(4), costs=np.array([cost])), 0.0) for cost in (1000.0, 1012.0)]
+    model = SimpleNamespace(
+        effects=(SimpleNamespace(hypothesis=h, p=np.array([1e-4])),), par=SimpleNamespace(stiffness=np.ones(6))
+    )
+    two = [
+        Candidate(h, SimpleNamespace(model=model, information=np.eye(4), costs=np.array([cost])), 0.0)
+        for cost in (1000.0, 1012.0)
+    ]
     for temper in (TEMPER, TEMPER_OF_NOISE):
-        assert weigh(two, np.zeros(1), np.ones(1), temper)[0].probability == pytest.approx(1.0 / (1.0 + np.exp(-6.0 / temper)), abs=1e-9)
+        assert weigh(two, np.zeros(1), np.ones(1), temper)[0].probability == pytest.approx(
+            1.0 / (1.0 + np.exp(-6.0 / temper)), abs=1e-9
+        )
 
 
 def test_a_round_within_the_noise_is_weighed_so(identified, hypotheses):
@@ -283,7 +315,9 @@ def test_a_round_within_the_noise_is_weighed_so(identified, hypotheses):
 
     def fitted(h, cost: float):
         model = replace(baseline.model, effects=(Effect(h, np.array([1e-4])),))
-        return replace(baseline, model=model, costs=quiet.costs - cost / 6.0, information=np.eye(len(baseline.information) + 1))
+        return replace(
+            baseline, model=model, costs=quiet.costs - cost / 6.0, information=np.eye(len(baseline.information) + 1)
+        )
 
     ranked = [(h, fitted(h, 212.0)), (other, fitted(other, 200.0))]
     for before, temper in ((quiet, TEMPER_OF_NOISE), (loud, TEMPER)):
@@ -304,7 +338,9 @@ def test_a_diagnosis_asks_held_out_data_about_its_causes(clean, identified, hypo
         return True
 
     monkeypatch.setattr("ident.diagnosis.identify", lambda *args, **rest: (setup, baseline))
-    monkeypatch.setattr("ident.diagnosis.attribute", lambda *args, **rest: Attribution(baseline, True, 0.0, (found,), final, False))
+    monkeypatch.setattr(
+        "ident.diagnosis.attribute", lambda *args, **rest: Attribution(baseline, True, 0.0, (found,), final, False)
+    )
     monkeypatch.setattr("ident.diagnosis.denied", deny)
     verdict = diagnose(clean[0])
     assert asked == [(setup.held_out, found)]
@@ -337,10 +373,22 @@ def test_the_special_case_of_a_law_that_goes_on_goes_on_too(hypotheses):
     """Coulomb friction is behind all laws that hold it, by what these have beyond it: noise, perhaps."""
     at = [h for h in hypotheses if h.place == "elbow_joint"]
     named = {h.effect: h for h in at}
-    order = ("friction_drift", "unknown:position_friction", "presliding_friction", "cogging", "coulomb_friction", "torque_lag")
-    found = [(named[effect], SimpleNamespace(cost=1001.0 + 10.0 * i, count=1000, converged=False)) for i, effect in enumerate(order)]
+    order = (
+        "friction_drift",
+        "unknown:position_friction",
+        "presliding_friction",
+        "cogging",
+        "coulomb_friction",
+        "torque_lag",
+    )
+    found = [
+        (named[effect], SimpleNamespace(cost=1001.0 + 10.0 * i, count=1000, converged=False))
+        for i, effect in enumerate(order)
+    ]
     assert [h.effect for h, _ in hopeful(found)] == [*order[:4], "coulomb_friction"]  # a decoy takes no place
-    others = [(named[effect], r) for effect, (_, r) in zip(("cogging", "torque_delay", "backlash"), found, strict=False)]
+    others = [
+        (named[effect], r) for effect, (_, r) in zip(("cogging", "torque_delay", "backlash"), found, strict=False)
+    ]
     assert [h.effect for h, _ in hopeful([*others, *found[4:]])] == ["cogging", "torque_delay", "backlash"]
 
 
@@ -380,7 +428,9 @@ def test_earlier_causes_are_weighed_again_before_more_is_sought(identified, hypo
         if h is None:
             return Round(current, (), (), 1.0, 0.0)
         model = replace(current.model, effects=(*current.model.effects, Effect(h, np.array([1e-4]))))
-        return Round(current, (Candidate(h, replace(current, model=model, costs=0.5 * current.costs), 0.0, 1.0),), (), 1.0, 1.0)
+        return Round(
+            current, (Candidate(h, replace(current, model=model, costs=0.5 * current.costs), 0.0, 1.0),), (), 1.0, 1.0
+        )
 
     def rematched(problem, current, rounds, workers):
         order.append([r.candidates[0].hypothesis.place for r in rounds])

@@ -97,8 +97,12 @@ def test_every_covariance_can_weight_a_fit(M, P):
 
 def test_realizations_lower_the_error_by_their_root():
     rng = np.random.default_rng(3)
+
     def rms(M):
-        return np.sqrt(np.mean([np.abs(average((b := closed_loop(rng, 0.05, M=M))[1], "jio") - b[0]) ** 2 for _ in range(30)]))
+        return np.sqrt(
+            np.mean([np.abs(average((b := closed_loop(rng, 0.05, M=M))[1], "jio") - b[0]) ** 2 for _ in range(30)])
+        )
+
     assert rms(16) / rms(4) == pytest.approx(0.5, rel=0.15)
 
 
@@ -232,9 +236,14 @@ def test_distortion_is_freed_of_what_the_loop_passes_on(ur10):
 
 
 def test_segments_that_do_not_say_which_they_are_are_all_used(clean):
-    """In sets of as many as there are joints; what is repeated, and what is beyond that number, makes sets of its own."""
+    """In sets of as many as there are joints; what is repeated, and what is beyond that number, makes sets of its
+    own."""
     data, _ = clean
-    point = [s for s in data.select(role="identification", kind="multisine") if s.amplitude == 1.0 and s.operating_point == "op01"]
+    point = [
+        s
+        for s in data.select(role="identification", kind="multisine")
+        if s.amplitude == 1.0 and s.operating_point == "op01"
+    ]
     numbers = [sorted(x) for x in experiment_sets(point, 6)]
     assert numbers == [[1, 2, 3, 4, 5, 6]] * (len(point) // 6) and len(point) >= 6
     unnumbered = [replace(s, experiment=None, realization=None) for s in point]

@@ -22,7 +22,8 @@ def gains(of_excitation, at_random, rng):
     """Closed shares and intervals of single records of random phase, and the share that many of them have.
 
     Args:
-        of_excitation, at_random: each (before, after), (K,) errors of a linear model and of stochastic nonlinear distortion.
+        of_excitation, at_random: each (before, after), (K,) errors of a linear model and of stochastic nonlinear
+            distortion.
     """
     excited = np.arange(LINES) % 4 == 1
 
@@ -30,7 +31,10 @@ def gains(of_excitation, at_random, rng):
         X = excited * np.exp(2j * np.pi * rng.random((n, LINES)))
         common = complex_normal(rng, X.shape)
         draws = (common, 0.5 * common + np.sqrt(0.75) * complex_normal(rng, X.shape))
-        return [np.abs(g * X + s * c + NOISE * complex_normal(rng, X.shape)) ** 2 for g, s, c in zip(of_excitation, at_random, draws)]
+        return [
+            np.abs(g * X + s * c + NOISE * complex_normal(rng, X.shape)) ** 2
+            for g, s, c in zip(of_excitation, at_random, draws)
+        ]
 
     noise = np.full((LINES, 1), NOISE**2)
     floor = np.sqrt(mean_squares(noise[None])[0, 0])

@@ -89,7 +89,9 @@ def test_a_stiff_hinge_changes_nothing_and_a_soft_one_adds_a_resonance(ur10):
 
 
 def test_a_hinge_before_a_joint_turns_with_its_carrier(ur10):
-    """About the joint's own axis it is the joint again; about another it does not turn with the joint, one after it does."""
+    """About the joint's own axis it is the joint again; about another it does not turn with the joint, one after it
+    does."""
+
     def hinge(axis, before):
         return Elasticity("h", "elbow_joint", axis, 1e4, 10.0, before)
 
@@ -105,7 +107,8 @@ def test_a_hinge_before_a_joint_turns_with_its_carrier(ur10):
         M, h, j = inertia(own, before, 0.7)
         assert M[h] @ M[h] == pytest.approx(M[j] @ M[j], rel=1e-9)
         assert M[h, h] == pytest.approx(M[j, j], rel=1e-12)
-    # The wrist alone turns about the elbow's x axis through its own offset; seen from the upper arm that axis stands still.
+    # The wrist alone turns about the elbow's x axis through its own offset; seen from the upper arm that axis stands
+    # still.
     after, before = ([inertia((1.0, 0.0, 0.0), side, elbow) for elbow in (0.2, 1.2)] for side in (False, True))
     a, b = ([M[h, h] for M, h, _ in runs] for runs in (after, before))
     assert a[0] == pytest.approx(a[1], rel=1e-9)
@@ -125,7 +128,9 @@ def test_the_body_of_a_link_is_changed_with_its_load_or_without(ur10):
     whole = body(build_structure(ur10, links={"wrist_3_link": replace(change, with_load=True)}))
     alone = body(build_structure(ur10, links={"wrist_3_link": change}))
     assert whole.isApprox(change.of(both), 1e-9)
-    assert alone.isApprox(change.of(bare) + placement.act(pin.Inertia(load.mass, np.array(load.com), np.array(load.inertia))), 1e-9)
+    assert alone.isApprox(
+        change.of(bare) + placement.act(pin.Inertia(load.mass, np.array(load.com), np.array(load.inertia))), 1e-9
+    )
     assert whole.mass == pytest.approx(0.9 * both.mass) and alone.mass == pytest.approx(0.9 * bare.mass + load.mass)
     links = [h for h in catalogue(build_structure(ur10)) if h.key == ("link_inertia", "wrist_3_link")]
     assert [h.options["with_load"] for h in links] == [False, True]
@@ -134,7 +139,8 @@ def test_the_body_of_a_link_is_changed_with_its_load_or_without(ur10):
 
 
 def test_images_of_a_held_torque_pass_the_drive_first():
-    """A current loop of a millisecond lets little of them pass: sampled motion of a bare motor behind it, in closed form."""
+    """A current loop of a millisecond lets little of them pass: sampled motion of a bare motor behind it, in closed
+    form."""
     T, inertia, lag = 1e-3, 0.7, 1e-3
     omega = 2 * np.pi * np.array([0.0, 5.0, 40.0, 150.0])
     found = alias_response(omega, T, "zoh", lambda s: 1.0 / (1.0 + lag * s)[:, None])[1:, 0]

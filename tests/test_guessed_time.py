@@ -19,7 +19,9 @@ X, U = 0.5 * np.sin(4 * T) + 0.3 * np.cos(11 * T), np.cos(4 * T)
 
 
 def written(folder, columns):
-    rows = "\n".join(";".join(x if isinstance(x, str) else f"{x:.12g}" for x in row) for row in zip(*columns.values(), strict=True))
+    rows = "\n".join(
+        ";".join(x if isinstance(x, str) else f"{x:.12g}" for x in row) for row in zip(*columns.values(), strict=True)
+    )
     (folder / "log.csv").write_text(";".join(columns) + "\n" + rows + "\n", encoding="utf-8")
     return folder / "log.csv"
 
@@ -55,9 +57,14 @@ def test_a_time_that_cannot_be_used_is_told_and_marked(tmp_path, kind, why, erro
     log, found, read = guessed(tmp_path, {"t": damaged(kind)})
     assert found.warnings == (f"no time: t {why}",) and "time" not in found.found
     assert "time" not in read and read["sample_rate"] == RATE
-    assert "EDIT: Hz, by the median step of t" in found.text and f"# EDIT: t is not used as the time: it {why}" in found.text
+    assert (
+        "EDIT: Hz, by the median step of t" in found.text
+        and f"# EDIT: t is not used as the time: it {why}" in found.text
+    )
     convert_logs([log], "twomass", tmp_path / "guessed.toml")  # as if even
-    (tmp_path / "map.toml").write_text(found.text.replace("# [time]\n# source", "[time]\nsource").replace('# unit = "s"', 'unit = "s"'))
+    (tmp_path / "map.toml").write_text(
+        found.text.replace("# [time]\n# source", "[time]\nsource").replace('# unit = "s"', 'unit = "s"')
+    )
     with pytest.raises(DataError) as caught:
         convert_logs([log], "twomass", tmp_path / "map.toml")
     assert error in str(caught.value)
@@ -105,11 +112,17 @@ def test_dates_of_several_ways_over_midnight(tmp_path, way):
 def test_a_month_that_may_be_a_day_is_said(tmp_path):
     for day, doubt in ((3, True), (23, False)):
         start = datetime(2026, 4, day, 10)
-        _, found, read = guessed(tmp_path, {"Date": [(start + timedelta(seconds=x)).strftime("%m/%d/%Y %H:%M:%S.%f") for x in T]})
-        assert ("EDIT? '04/03/2026 10:00:00.000000' taken as month/day" in found.found["time"]) == doubt and read["sample_rate"] == RATE
+        _, found, read = guessed(
+            tmp_path, {"Date": [(start + timedelta(seconds=x)).strftime("%m/%d/%Y %H:%M:%S.%f") for x in T]}
+        )
+        assert ("EDIT? '04/03/2026 10:00:00.000000' taken as month/day" in found.found["time"]) == doubt and read[
+            "sample_rate"
+        ] == RATE
 
 
-@pytest.mark.parametrize(("rate", "unit", "marked"), [(10.0, "s", True), (4.0, "s", True), (1000.0, "ms", True), (250.0, "s", False)])
+@pytest.mark.parametrize(
+    ("rate", "unit", "marked"), [(10.0, "s", True), (4.0, "s", True), (1000.0, "ms", True), (250.0, "s", False)]
+)
 def test_a_slow_log_is_no_fast_one_in_another_unit(tmp_path, rate, unit, marked):
     t = np.arange(4000 if unit == "ms" else 600) / rate
     column = {"t": t * (1e3 if unit == "ms" else 1) + (0.013 * np.sin(np.arange(4000)) if unit == "ms" else 0)}
@@ -118,14 +131,19 @@ def test_a_slow_log_is_no_fast_one_in_another_unit(tmp_path, rate, unit, marked)
     assert ("EDIT" in found.found["time"]) == marked and ("EDIT" in found.text.split("\n")[2]) == marked
 
 
-@pytest.mark.parametrize("names", [("header.stamp.sec", "header.stamp.nanosec", 1e9), ("secs", "nsecs", 1e9), ("tv_sec", "tv_usec", 1e6)])
+@pytest.mark.parametrize(
+    "names", [("header.stamp.sec", "header.stamp.nanosec", 1e9), ("secs", "nsecs", 1e9), ("tv_sec", "tv_usec", 1e6)]
+)
 def test_seconds_with_their_fraction_in_another_column(tmp_path, names):
     at = T + 1.73e9 + 0.4
     full = np.floor(at)
     columns = {names[0]: [str(int(x)) for x in full], names[1]: [str(round((t + 0.4) % 1 * names[2])) for t in T]}
     log, found, read = guessed(tmp_path, columns)
     unit = "ns" if names[2] == 1e9 else "us"
-    assert read["time"] == {"source": names[0], "unit": "s", "plus": [{"source": names[1], "unit": unit}]} and read["sample_rate"] == RATE
+    assert (
+        read["time"] == {"source": names[0], "unit": "s", "plus": [{"source": names[1], "unit": unit}]}
+        and read["sample_rate"] == RATE
+    )
     segments = convert_logs([log], "twomass", tmp_path / "guessed.toml").segments
     assert np.allclose(np.concatenate([s.q for s in segments])[:, 0], 0.5 * np.sin(4 * T), atol=1e-9)
     (tmp_path / "map.toml").write_text(found.text.replace("plus", "plsu"))

@@ -13,8 +13,19 @@ RATE = 500.0
 
 def log_of(folder, q, tau, names=("q{}", "tau{}")):
     t = np.arange(len(q)) / RATE
-    columns = {"t": t} | {names[0].format(j + 1): x for j, x in enumerate(q.T)} | {names[1].format(j + 1): x for j, x in enumerate(tau.T)}
-    np.savetxt(folder / "log.csv", np.stack(list(columns.values()), axis=1), header=",".join(columns), comments="", delimiter=",", fmt="%.9g")
+    columns = (
+        {"t": t}
+        | {names[0].format(j + 1): x for j, x in enumerate(q.T)}
+        | {names[1].format(j + 1): x for j, x in enumerate(tau.T)}
+    )
+    np.savetxt(
+        folder / "log.csv",
+        np.stack(list(columns.values()), axis=1),
+        header=",".join(columns),
+        comments="",
+        delimiter=",",
+        fmt="%.9g",
+    )
     return folder / "log.csv"
 
 
@@ -38,7 +49,10 @@ def back_and_forth(N=3000, n=6):
     return q, 20 * np.sin(q + np.arange(n)) - 8 * np.tanh(v / 0.05)
 
 
-@pytest.mark.parametrize(("motion", "told"), [(one_way, False), (lambda: tuple(x[:400] for x in back_and_forth()), False), (back_and_forth, True)])
+@pytest.mark.parametrize(
+    ("motion", "told"),
+    [(one_way, False), (lambda: tuple(x[:400] for x in back_and_forth()), False), (back_and_forth, True)],
+)
 def test_a_sign_is_set_by_a_motion_that_turns_round_and_left_by_others(tmp_path, motion, told):
     text, columns = columns_of(log_of(tmp_path, *motion()))
     assert all(("sign" in columns[f"tau_{j + 1}"]) == told for j in range(6))
@@ -50,7 +64,7 @@ def test_a_side_is_set_by_a_motion_that_turns_round_and_left_by_others(tmp_path,
     q, tau = motion()
     text, columns = columns_of(log_of(tmp_path, q, -tau / load_robot("ur10_bare").array("gear_ratio")))
     assert all((columns[f"tau_{j + 1}"].get("side") == "motor") == told for j in range(6))
-    assert ('EDIT: ' in text and 'before the gear (side = "motor")?' in text) != told
+    assert ("EDIT: " in text and 'before the gear (side = "motor")?' in text) != told
 
 
 def test_joints_that_turn_round_too_seldom_are_named(tmp_path):

@@ -16,7 +16,30 @@ from ident.dataset_io import load_dataset, save_dataset
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 
-ODD = (-1, 0, 2**70, 10**400, 1.5, 1e308, float("inf"), float("nan"), True, "", "x", "\x00", "y" * 5000, "..", "²", [], [[]], ["x"], [10**400] * 6, [float("nan")] * 6, {}, {"a": 1})
+ODD = (
+    -1,
+    0,
+    2**70,
+    10**400,
+    1.5,
+    1e308,
+    float("inf"),
+    float("nan"),
+    True,
+    "",
+    "x",
+    "\x00",
+    "y" * 5000,
+    "..",
+    "²",
+    [],
+    [[]],
+    ["x"],
+    [10**400] * 6,
+    [float("nan")] * 6,
+    {},
+    {"a": 1},
+)
 
 
 @pytest.fixture
@@ -25,14 +48,38 @@ def folder(tmp_path, ur10):
     N, n = 64, 6
 
     def segment(name, **kwargs):
-        return Segment(name=name, role="identification", t=np.arange(N) / 1000.0, tau=rng.normal(size=(N, n)), q=rng.normal(size=(N, n)), **kwargs)
+        return Segment(
+            name=name,
+            role="identification",
+            t=np.arange(N) / 1000.0,
+            tau=rng.normal(size=(N, n)),
+            q=rng.normal(size=(N, n)),
+            **kwargs,
+        )
 
     multisine = segment(
-        "a", kind="multisine", operating_point="op01", q0=np.zeros(n), period=32, periods=2, transient_periods=1,
-        experiment=1, realization=1, amplitude=0.5, excited_lines=np.array([3, 5]),
+        "a",
+        kind="multisine",
+        operating_point="op01",
+        q0=np.zeros(n),
+        period=32,
+        periods=2,
+        transient_periods=1,
+        experiment=1,
+        realization=1,
+        amplitude=0.5,
+        excited_lines=np.array([3, 5]),
     )
     data = Dataset(
-        "small", "ur10", ur10, 1000.0, ur10.joint_names, "zoh", np.full(n, 1e-6), np.full(n, 0.1), {"type": "pd"},
+        "small",
+        "ur10",
+        ur10,
+        1000.0,
+        ur10.joint_names,
+        "zoh",
+        np.full(n, 1e-6),
+        np.full(n, 0.1),
+        {"type": "pd"},
         (multisine, segment("b", kind="trajectory")),
     )
     save_dataset(data, tmp_path / "d")
@@ -65,11 +112,23 @@ def set_odd(table, key, value) -> None:
 
 
 REFUSED = {  # keys of which no odd value is sound
-    "format", "robot", "sample_rate", "joints", "input_hold", "segment", "file", "kind", "role", "period", "periods",
+    "format",
+    "robot",
+    "sample_rate",
+    "joints",
+    "input_hold",
+    "segment",
+    "file",
+    "kind",
+    "role",
+    "period",
+    "periods",
 }
 
 
-@pytest.mark.parametrize("key", ["format", "name", "robot", "sample_rate", "joints", "input_hold", "noise", "controller", "segment"])
+@pytest.mark.parametrize(
+    "key", ["format", "name", "robot", "sample_rate", "joints", "input_hold", "noise", "controller", "segment"]
+)
 def test_every_odd_header_value_loads_or_is_one_line(folder, key):
     original = (folder / "dataset.toml").read_text()
     for value in (None, *ODD):
@@ -78,13 +137,30 @@ def test_every_odd_header_value_loads_or_is_one_line(folder, key):
         (folder / "dataset.toml").write_text(original)
         rewrite(folder / "dataset.toml", lambda head, v=value: set_odd(head, key, v))
         line = outcome(load_dataset, folder)
-        if key in REFUSED and not (key == "input_hold" and value is None) and not (key == "sample_rate" and value == 1.0):
+        if (
+            key in REFUSED
+            and not (key == "input_hold" and value is None)
+            and not (key == "sample_rate" and value == 1.0)
+        ):
             assert line is not None, value
 
 
 @pytest.mark.parametrize(
     "key",
-    ["file", "kind", "role", "operating_point", "q0", "period", "periods", "transient_periods", "experiment", "realization", "amplitude", "excited_lines"],
+    [
+        "file",
+        "kind",
+        "role",
+        "operating_point",
+        "q0",
+        "period",
+        "periods",
+        "transient_periods",
+        "experiment",
+        "realization",
+        "amplitude",
+        "excited_lines",
+    ],
 )
 def test_every_odd_segment_value_loads_or_is_one_line(folder, key):
     original = (folder / "dataset.toml").read_text()
@@ -172,7 +248,18 @@ def test_corrupt_bytes_load_or_are_one_line(folder):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "\n", "t\n", "\x00\x01\x02", "t,tau_1\n0,1\n0.001,1,2\n", "t;tau_1\n0;1\n", '"t\n', "\ufefft,tau_1\n", "t,t\n0,0\n", "t\n" + "0\n" * 20],
+    [
+        "",
+        "\n",
+        "t\n",
+        "\x00\x01\x02",
+        "t,tau_1\n0,1\n0.001,1,2\n",
+        "t;tau_1\n0;1\n",
+        '"t\n',
+        "\ufefft,tau_1\n",
+        "t,t\n0,0\n",
+        "t\n" + "0\n" * 20,
+    ],
 )
 def test_a_broken_csv_is_one_line(folder, text):
     (folder / "a.csv").write_text(text)

@@ -43,10 +43,17 @@ def run_here(args: list[str], capfd, monkeypatch) -> tuple[int, str]:
 
 def run_alone(args: list[str], folder: Path) -> tuple[int, str]:
     """The same in a process of its own, whose memory is measured."""
-    env = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "SIMGAP_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    env = os.environ | {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "SIMGAP_THREADS": "1",
+        "PYTHONPATH": str(ROOT),
+    }
     log = folder.parent / f"{folder.name}-stderr"
     with log.open("w") as stderr:
-        process = subprocess.Popen([sys.executable, "-m", "ident.cli", *args], stdout=subprocess.DEVNULL, stderr=stderr, env=env)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ident.cli", *args], stdout=subprocess.DEVNULL, stderr=stderr, env=env
+        )
     pid, began = 0, time.monotonic()
     while not pid and time.monotonic() - began < 2 * SECONDS:
         pid, status, usage = os.wait4(process.pid, os.WNOHANG)

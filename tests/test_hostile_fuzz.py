@@ -111,7 +111,15 @@ def test_a_plan_with_any_value_is_read_or_refused(path, value):
             one_line(plan_from_toml, Path(name) / "plan.toml")
 
 
-@given(cuts=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 12), st.text(st.characters(codec="utf-8"), max_size=12).map(str.encode)), min_size=1, max_size=3))
+@given(
+    cuts=st.lists(
+        st.tuples(
+            st.floats(0, 1), st.integers(0, 12), st.text(st.characters(codec="utf-8"), max_size=12).map(str.encode)
+        ),
+        min_size=1,
+        max_size=3,
+    )
+)
 @EXAMPLES
 def test_a_damaged_urdf_is_read_or_refused(cuts):
     with tempfile.TemporaryDirectory() as name:

@@ -89,7 +89,8 @@ def test_a_held_out_segment_that_ran_away_tells_nothing(clean):
 
 @pytest.mark.parametrize("kind", ["multisine", "trajectory"])
 def test_held_out_data_change_nothing_of_what_is_fitted(kind):
-    """Neither their noise, nor their band, nor steps of their encoder: of data whose noise is not given and does not show between periods."""
+    """Neither their noise, nor their band, nor steps of their encoder: of data whose noise is not given and does not
+    show between periods."""
     robot = load_robot("twomass")
     plan = small_plan(robot, 3, points=1, levels=(10.0,), period=500, periods=2, trajectory=True)
     data = run_experiment(plan, [], seed=3)
@@ -103,11 +104,15 @@ def test_held_out_data_change_nothing_of_what_is_fitted(kind):
         rng = np.random.default_rng(0)
         lines = np.union1d(s.excited_lines, [200]) if s.kind == "multisine" else s.excited_lines
         q = np.round(s.q + 1e-4 * rng.normal(size=s.q.shape), 3)
-        return replace(s, name=f"held-{s.name}", q=q, tau=5.0 * s.tau + rng.normal(size=s.tau.shape), excited_lines=lines)
+        return replace(
+            s, name=f"held-{s.name}", q=q, tau=5.0 * s.tau + rng.normal(size=s.tau.shape), excited_lines=lines
+        )
 
     plain = replace(data, q_std=None, tau_std=None)
     a, b = (identify(replace(plain, segments=(*told, *more))) for more in ((), map(changed, held_out)))
-    assert np.array_equal(a[0].problem.q_std, b[0].problem.q_std) and np.array_equal(a[0].problem.tau_std, b[0].problem.tau_std)
+    assert np.array_equal(a[0].problem.q_std, b[0].problem.q_std) and np.array_equal(
+        a[0].problem.tau_std, b[0].problem.tau_std
+    )
     assert [g.n_compared for g in a[0].problem.groups] == [g.n_compared for g in b[0].problem.groups]
     assert a[0].steps == b[0].steps and np.array_equal(pack(a[1].model), pack(b[1].model))
 
@@ -154,7 +159,13 @@ def test_measured_frfs_agree_with_the_true_arm(clean):
 def test_every_frf_estimator_finds_the_drives(clean, estimator):
     data, drives = clean
     result = fit_frf(
-        build_structure(data.robot), estimate_frf(data), Parameters.nominal(data.robot), sample_time=1e-3, hold="zoh", estimator=estimator, starts=(Parameters.nominal(data.robot),)
+        build_structure(data.robot),
+        estimate_frf(data),
+        Parameters.nominal(data.robot),
+        sample_time=1e-3,
+        hold="zoh",
+        estimator=estimator,
+        starts=(Parameters.nominal(data.robot),),
     )
     error = np.abs(relative_errors(result.parameters, drives))
     limit = 0.02 if estimator in ("nls", "lls") else 0.005
@@ -174,9 +185,19 @@ def test_a_ripple_that_is_fast_along_a_motion_does_not_fold_into_its_band(ur10):
     """The ripple passes at up to 40 Hz where the motion is compared below 3 Hz."""
     drives = draw_drives(np.random.default_rng(4), ur10)
     plan = small_plan(ur10, 4, points=1, levels=(1.0,), validation_points=0, trajectory=True)
-    data = run_experiment(plan, [parse_effect("cogging@elbow_joint:amplitude=4,periods_per_rev=606,phase=0.7", ur10)], seed=4, drives=drives)
+    data = run_experiment(
+        plan,
+        [parse_effect("cogging@elbow_joint:amplitude=4,periods_per_rev=606,phase=0.7", ur10)],
+        seed=4,
+        drives=drives,
+    )
     setup = set_up(data)
-    figures = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
+    figures = {
+        "stiffness": "stiffness",
+        "damping": "damping",
+        "inertia": "motor_inertia",
+        "viscous": "viscous_friction",
+    }
     par = replace(setup.problem.nominal, **{k: drives[v] for k, v in figures.items()})
     bare = Model(setup.problem.structure, par)
     (h,) = (h for h in catalogue(setup.problem.structure) if h.key == ("cogging", "elbow_joint"))
@@ -188,7 +209,8 @@ def test_a_ripple_that_is_fast_along_a_motion_does_not_fold_into_its_band(ur10):
 
 
 def test_links_behind_gears_are_found_beside_elastic_hinges(tmp_path):
-    """An arm with hinges has more link coordinates than joints: what pulls on a link sees the one that its joint drives."""
+    """An arm with hinges has more link coordinates than joints: what pulls on a link sees the one that its joint
+    drives."""
     irb = load_robot("irb")
     spring = parse_effect("gravity_spring@joint_2:stiffness=900,rest_angle=0.2", irb)
     data = run_experiment(small_plan(irb, 3, levels=(0.5,), period=1000), [spring], seed=3)
@@ -216,7 +238,8 @@ GEAR, LAG = ("hardening_stiffness", "panda_joint4"), ("torque_lag", "panda_joint
 
 @pytest.mark.parametrize("keys", [(), (GEAR,), (GEAR, LAG), (("payload", "flange"),)])
 def test_exact_columns_are_the_differences_of_what_a_model_predicts(panda_problem, keys):
-    """Gears that give under gravity move the posture, and with it all torques of a motion: with the remainder held that is missed."""
+    """Gears that give under gravity move the posture, and with it all torques of a motion: with the remainder held that
+    is missed."""
     problem = panda_problem
     start = {"hardening_stiffness": [1e9], "torque_lag": [2e-3], "payload": [2.0, 0.02, 0.0, 0.05, 0.01, 0.01, 0.01]}
     effects = tuple(Effect(h, np.array(start[h.effect])) for h in catalogue(problem.structure) if h.key in keys)
@@ -232,14 +255,18 @@ def test_exact_columns_are_the_differences_of_what_a_model_predicts(panda_proble
             y = x.copy()
             y[c] += sign * step
             there = unpack(model, y, np.inf)
-            ends.append(predict(there, group, problem.sampling, W=pred.solution.W, steps=20, torques=pred.solution.torques).U)
+            ends.append(
+                predict(there, group, problem.sampling, W=pred.solution.W, steps=20, torques=pred.solution.torques).U
+            )
         slope = (ends[0] - ends[1])[:, : held.shape[1]] / (2 * step)
         for errors, columns in ((missed, held), (left, exact)):
             errors.append(np.linalg.norm(columns[..., c] - slope) / np.linalg.norm(slope))
     assert max(left) < 0.02 and max(left) < 0.2 * max(missed)
 
 
-@pytest.mark.parametrize(("key", "value", "exact"), [(GEAR, 1e9, True), (("coulomb_friction", "panda_joint4"), 0.5, False)])
+@pytest.mark.parametrize(
+    ("key", "value", "exact"), [(GEAR, 1e9, True), (("coulomb_friction", "panda_joint4"), 0.5, False)]
+)
 def test_a_winner_beside_a_law_of_the_gear_is_fitted_by_exact_columns(panda_problem, key, value, exact):
     """And no other: the information that its deviations come from says which were used."""
     problem = panda_problem
@@ -289,7 +316,8 @@ def test_the_baseline_is_weighted_by_the_noise_that_it_sees_itself(identified):
 
 
 def test_a_common_offset_in_time_is_a_delay_where_there_is_one_joint(clean):
-    """That of its drive or its sensor, if the torque is held; where nothing is said of the hold half a sample may be due to that."""
+    """That of its drive or its sensor, if the torque is held; where nothing is said of the hold half a sample may be
+    due to that."""
     robot = load_robot("twomass")
     data = run_experiment(small_plan(robot, 4, period=500), seed=4)
     assert data.input_hold == clean[0].input_hold == "zoh"

@@ -76,7 +76,9 @@ def test_a_linear_drive_has_guesses_in_kg_and_newtons(tmp_path, limit, axis):
     joint = robot.joints[0]
     assert joint.motor_inertia == pytest.approx(12.0) and joint.gear_ratio == 1.0
     assert np.sqrt(joint.stiffness / 12.0) / 2 / np.pi == pytest.approx(30.0, rel=0.01)
-    assert joint.torque_limit == 150.0 if "150" in limit else joint.torque_limit > (2 * 12 * 9.8 if axis[-1] == "1" else 0)
+    assert (
+        joint.torque_limit == 150.0 if "150" in limit else joint.torque_limit > (2 * 12 * 9.8 if axis[-1] == "1" else 0)
+    )
     text = (tmp_path / "slide" / "robot.toml").read_text()
     assert "N s/m" in text and "GUESS" in text and "rad" not in text.split("[[joint]]")[1]
 
@@ -119,7 +121,14 @@ def test_the_command_writes_a_robot_that_loads_and_simulates(tmp_path):
 def test_bad_usage_is_one_line_and_leaves_nothing(tmp_path, args):
     (tmp_path / "log.csv").write_text("a,b\n1,2\n")
     args = [str(load_robot("irb").urdf) if a == "ARM" else a for a in args]
-    run = subprocess.run([sys.executable, "-m", "ident.cli", *args], capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path)
+    run = subprocess.run(
+        [sys.executable, "-m", "ident.cli", *args],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=tmp_path,
+    )
     assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1, run.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
 
@@ -228,7 +237,9 @@ def test_roles_and_split(tmp_path, slide):
 
 def test_a_csv_with_semicolons_and_decimal_commas(tmp_path, slide):
     (tmp_path / "log.csv").write_text("Kraft; Weg\n" + "1,5;0,25\n-2,5;0,50\n" * 8)
-    (tmp_path / "map.toml").write_text('sample_rate = 10.0\n[columns]\ntau_1 = { source = "Kraft", unit = "N" }\nq_1 = { source = "Weg", unit = "m" }\n')
+    (tmp_path / "map.toml").write_text(
+        'sample_rate = 10.0\n[columns]\ntau_1 = { source = "Kraft", unit = "N" }\nq_1 = { source = "Weg", unit = "m" }\n'
+    )
     s = convert_logs([tmp_path / "log.csv"], slide.folder, tmp_path / "map.toml").segments[0]
     assert s.tau[:, 0].tolist() == [1.5, -2.5] * 8 and s.q[:, 0].tolist() == [0.25, 0.5] * 8
 
@@ -273,7 +284,9 @@ def test_a_map_that_is_wrong_is_one_clear_error(tmp_path, slide, change, found):
 @pytest.mark.parametrize("content", [b"", b"a b c\n1 2\n", b"\x00\xff" * 300, b"MATLAB 5.0 MAT-file" + b"\x01" * 500])
 def test_a_damaged_log_is_one_clear_error(tmp_path, slide, suffix, content):
     (tmp_path / f"log{suffix}").write_bytes(content)
-    (tmp_path / "map.toml").write_text('sample_rate = 500.0\n[columns]\ntau_1 = { source = "u" }\nq_1 = { source = "x" }\n')
+    (tmp_path / "map.toml").write_text(
+        'sample_rate = 500.0\n[columns]\ntau_1 = { source = "u" }\nq_1 = { source = "x" }\n'
+    )
     with pytest.raises(DataError) as caught:
         convert_logs([tmp_path / f"log{suffix}"], slide.folder, tmp_path / "map.toml")
     assert "\n" not in str(caught.value)
@@ -301,8 +314,19 @@ def test_a_guessed_map_brings_a_csv_to_si_units(tmp_path, pair, angle, time, fir
     columns = {time[0]: t * time[1]}
     for j in range(2):
         columns |= {f"pos_{j + first}": q[:, j] * angle[1], f"vel_{j + first}": qd[:, j] * angle[1]}
-        columns |= {f"pos_ref_{j + first}": q[:, j] * angle[1] + 0.01, f"torque_{j + first}": tau[:, j], f"temp_{j + first}": 30 + q[:, j]}
-    np.savetxt(tmp_path / "log.csv", np.stack(list(columns.values()), axis=1), header=",".join(columns), comments="", delimiter=",", fmt="%.15g")
+        columns |= {
+            f"pos_ref_{j + first}": q[:, j] * angle[1] + 0.01,
+            f"torque_{j + first}": tau[:, j],
+            f"temp_{j + first}": 30 + q[:, j],
+        }
+    np.savetxt(
+        tmp_path / "log.csv",
+        np.stack(list(columns.values()), axis=1),
+        header=",".join(columns),
+        comments="",
+        delimiter=",",
+        fmt="%.15g",
+    )
     guessed, data = converted([tmp_path / "log.csv"], pair.folder, tmp_path)
     assert set(guessed.found) == {"time", "tau", "q", "qd", "q_ref", "temp"}
     assert data.sample_rate == 500.0 and [s.role for s in data.segments] == ["identification", "validation"]
@@ -314,11 +338,20 @@ def test_a_guessed_map_finds_side_sign_and_layout_of_a_mat_file(tmp_path, pair):
     _, q, qd, tau = motion()
     ratio = np.array([50.0, 100.0])
     sign = np.array([1.0, -1.0])
-    rec = {"act_theta_mot": (q * ratio).T, "motor_torque": (sign * tau / ratio).T, "speed_rpm": (qd * ratio * 30 / np.pi).T, "encoder_link": q.T + 1e-4}
+    rec = {
+        "act_theta_mot": (q * ratio).T,
+        "motor_torque": (sign * tau / ratio).T,
+        "speed_rpm": (qd * ratio * 30 / np.pi).T,
+        "encoder_link": q.T + 1e-4,
+    }
     scipy.io.savemat(tmp_path / "log.mat", {"log": rec, "other": {"fs": 500.0, "kp": [1.0, 2.0]}, "name": "a text"})
     guessed, data = converted([tmp_path / "log.mat"], pair.folder, tmp_path)
     assert set(guessed.found) == {"tau", "q", "qd", "q_link"} and data.sample_rate == 500.0
-    assert np.allclose(whole(data, "q"), q) and np.allclose(whole(data, "qd"), qd) and np.allclose(whole(data, "q_link"), q + 1e-4)
+    assert (
+        np.allclose(whole(data, "q"), q)
+        and np.allclose(whole(data, "qd"), qd)
+        and np.allclose(whole(data, "q_link"), q + 1e-4)
+    )
     assert np.allclose(whole(data, "tau"), tau)
     assert "sign = -1" in guessed.text and "joints 2" in guessed.text
 
@@ -382,7 +415,13 @@ def write_bag(path, topics):
         for topic, rows in topics.items():
             for stamp, names, position, velocity, effort in rows:
                 header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": ""}
-                message = {"header": header, "name": names, "position": position, "velocity": velocity, "effort": effort}
+                message = {
+                    "header": header,
+                    "name": names,
+                    "position": position,
+                    "velocity": velocity,
+                    "effort": effort,
+                }
                 writer.write_message(topic, schema, message, log_time=stamp + 1000, publish_time=stamp)
                 writer.write_message("/load", other, {"data": 1.0}, log_time=stamp, publish_time=stamp)
         writer.finish()
@@ -395,7 +434,15 @@ def bag(tmp_path):
     start = 1_700_000_000_123_456_789
     rows = []
     for k in range(len(t)):
-        rows.append((start + round(t[k] * 1e9), ["two", "one"], q[k, ::-1].tolist(), qd[k, ::-1].tolist(), tau[k, ::-1].tolist()))
+        rows.append(
+            (
+                start + round(t[k] * 1e9),
+                ["two", "one"],
+                q[k, ::-1].tolist(),
+                qd[k, ::-1].tolist(),
+                tau[k, ::-1].tolist(),
+            )
+        )
         if k % 10 == 5:
             rows.append((start + round(t[k] * 1e9), ["finger"], [0.01], [], []))
     write_bag(tmp_path / "log.mcap", {"/joint_states": rows})
@@ -426,7 +473,9 @@ def test_joint_states_of_mcap_and_rosbag2_files(tmp_path, pair, bag):
         db.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
         db.execute("INSERT INTO topics VALUES (1, '/joint_states', 'sensor_msgs/msg/JointState', 'cdr')")
         for _, _, message in make_reader(file).iter_messages(topics=["/joint_states"]):
-            db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (message.log_time, message.data))
+            db.execute(
+                "INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (message.log_time, message.data)
+            )
     db.close()
     (tmp_path / "map.toml").write_text(BAG_MAP)
     for name in ("log.mcap", "log.db3"):
@@ -439,7 +488,9 @@ def test_a_guessed_map_of_a_bag(tmp_path, pair, bag):
     _, q, qd, tau = motion()
     guessed, data = converted([bag[0]], pair.folder, tmp_path)
     assert 'source = "stamp"' in guessed.text and data.sample_rate == 500.0
-    assert np.allclose(whole(data, "q"), q) and np.allclose(whole(data, "tau"), tau) and np.allclose(whole(data, "qd"), qd)
+    assert (
+        np.allclose(whole(data, "q"), q) and np.allclose(whole(data, "tau"), tau) and np.allclose(whole(data, "qd"), qd)
+    )
 
 
 def test_topics_of_two_arms_and_fields_left_empty(tmp_path, pair, bag):
@@ -449,10 +500,14 @@ def test_topics_of_two_arms_and_fields_left_empty(tmp_path, pair, bag):
     (tmp_path / "map.toml").write_text(BAG_MAP)
     with pytest.raises(DataError, match="/left/joint_states:"):
         convert_logs([tmp_path / "two.mcap"], pair.folder, tmp_path / "map.toml")
-    (tmp_path / "map.toml").write_text(re.sub(r'= "(effort|position|velocity|stamp)', r'= "/left/joint_states:\1', BAG_MAP))
+    (tmp_path / "map.toml").write_text(
+        re.sub(r'= "(effort|position|velocity|stamp)', r'= "/left/joint_states:\1', BAG_MAP)
+    )
     s = convert_logs([tmp_path / "two.mcap"], pair.folder, tmp_path / "map.toml").segments[0]
     assert np.array_equal(s.q, motion()[1])
-    (tmp_path / "map.toml").write_text(re.sub(r'= "(effort|position|velocity|stamp)', r'= "/right/joint_states:\1', BAG_MAP))
+    (tmp_path / "map.toml").write_text(
+        re.sub(r'= "(effort|position|velocity|stamp)', r'= "/right/joint_states:\1', BAG_MAP)
+    )
     with pytest.raises(DataError, match=r"no /right/joint_states:effort\.one"):
         convert_logs([tmp_path / "two.mcap"], pair.folder, tmp_path / "map.toml")
 
@@ -528,7 +583,11 @@ def test_the_kr300_agrees_with_its_published_si_signals(tmp_path):
     assert roles(data) == [("FF_A", "identification"), ("FF_B", "validation")]
     for s, name in zip(data.segments, "AB"):
         std = np.load(DATA / "kuka_kr300_dual_encoder" / f"std_{name}.npz")
-        assert np.array_equal(s.q, std["q_motor"]) and np.array_equal(s.qd, std["dq_motor"]) and np.array_equal(s.q_ref, std["q_ref"])
+        assert (
+            np.array_equal(s.q, std["q_motor"])
+            and np.array_equal(s.qd, std["dq_motor"])
+            and np.array_equal(s.q_ref, std["q_ref"])
+        )
         assert np.array_equal(s.q_link[:, :3], std["q_link"][:, :3]) and np.all(np.isnan(s.q_link[:, 3:]))
         assert np.allclose(s.tau, std["tau_motor"] * std["gear"], rtol=1e-8)
         assert np.all(s.q > data.robot.q_min) and np.all(s.q < data.robot.q_max)
@@ -539,7 +598,11 @@ def test_the_emps_agrees_with_its_published_si_signals(tmp_path):
     assert [r for _, r in roles(data)] == ["identification", "validation"]
     std = np.load(DATA / "emps_drive" / "std_DATA_EMPS.npz")
     q, force = whole(data, "q")[:, 0], whole(data, "tau")[:, 0]
-    assert np.array_equal(q, std["q"]) and np.allclose(force, std["force"], rtol=1e-12) and np.array_equal(whole(data, "q_ref")[:, 0], std["q_ref"])
+    assert (
+        np.array_equal(q, std["q"])
+        and np.allclose(force, std["force"], rtol=1e-12)
+        and np.array_equal(whole(data, "q_ref")[:, 0], std["q_ref"])
+    )
     # The published model: M = 95.109 kg, Fv = 203.50 N s/m, Fc = 20.394 N, offset -3.165 N.
     b, a = scipy.signal.butter(4, 50 / 500)
     smooth = scipy.signal.filtfilt(b, a, q)
@@ -564,7 +627,11 @@ def test_the_tx40_agrees_with_its_published_si_signals(tmp_path):
 def test_the_ur10_agrees_with_its_published_si_signals(tmp_path):
     data = machine("ur10_unisa", ["ur10_exciting_trajectory.db3"], "ur10_bare", tmp_path)
     std = np.load(DATA / "ur10_unisa" / "std.npz")
-    assert np.array_equal(whole(data, "q"), std["q"]) and np.array_equal(whole(data, "qd"), std["dq"]) and np.array_equal(whole(data, "tau"), std["tau"])
+    assert (
+        np.array_equal(whole(data, "q"), std["q"])
+        and np.array_equal(whole(data, "qd"), std["dq"])
+        and np.array_equal(whole(data, "tau"), std["tau"])
+    )
 
 
 def test_the_panda_agrees_with_its_published_si_signals(tmp_path):
@@ -593,7 +660,10 @@ def rigid_r2(data, coulomb):
         rows[s.role] = (v, q, tau - rigid, tau)
     out = []
     for j in range(robot.n):
-        columns = [np.stack([np.tanh(v[:, j] / coulomb), v[:, j], np.ones(len(v)), np.sin(q[:, j])], axis=1) for v, q, _, _ in rows.values()]
+        columns = [
+            np.stack([np.tanh(v[:, j] / coulomb), v[:, j], np.ones(len(v)), np.sin(q[:, j])], axis=1)
+            for v, q, _, _ in rows.values()
+        ]
         x = np.linalg.lstsq(columns[0], rows["identification"][2][:, j])[0]
         rest = rows["validation"][2][:, j] - columns[1] @ x
         out.append(1 - np.var(rest) / np.var(rows["validation"][3][:, j]))
@@ -606,7 +676,12 @@ def rigid_r2(data, coulomb):
         ("kuka_kr300_dual_encoder", ["FF_A.mat", "FF_B.mat"], "kr300", 0.75),
         ("staubli_tx40", ["curr_data.csv", "pos_read_data.csv"], "tx40", 0.85),
         ("ur10_unisa", ["ur10_exciting_trajectory.db3"], "ur10_bare", 0.85),
-        ("panda_gaz_ral2019", [f"exciting_traj_{k}.txt" for k in ("time", "positions", "velocity", "torques")], "panda_bare", 0.9),
+        (
+            "panda_gaz_ral2019",
+            [f"exciting_traj_{k}.txt" for k in ("time", "positions", "velocity", "torques")],
+            "panda_bare",
+            0.9,
+        ),
     ],
 )
 def test_the_robot_of_each_machine_explains_its_torque(tmp_path, folder, files, robot, least):

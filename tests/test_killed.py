@@ -126,7 +126,12 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_killed_command_leaves_whole_outputs(inputs, tmp_path, command):
     out, rng = tmp_path / "out", np.random.default_rng(len(command))
-    env = os.environ | {"PYTHONPATH": str(ROOT), "SIMGAP_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    env = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "SIMGAP_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
     args = [sys.executable, "-m", "ident.cli", *COMMANDS[command], "--out", str(out), "--quiet"]
     began = time.monotonic()
     subprocess.run(args, cwd=inputs, env=env, check=True, capture_output=True)

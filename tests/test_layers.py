@@ -51,7 +51,10 @@ def test_assets_know_no_engine(path):
 
 def arrows() -> dict[str, set[str]]:
     """Modules of ``ident`` by name, and the modules of it that each imports."""
-    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in ROOT.glob("ident/**/*.py")}
+    modules = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in ROOT.glob("ident/**/*.py")
+    }
     out = {}
     for name, path in modules.items():
         found = [({f"{module}.{x}" for x in names} & set(modules)) or {module} for module, names in statements(path)]
@@ -61,15 +64,29 @@ def arrows() -> dict[str, set[str]]:
 
 def test_no_module_of_ident_hangs_on_itself():
     order = list(TopologicalSorter(arrows()).static_order())
-    assert order.index("ident.graybox") < order.index("ident.torque_fit") < order.index("ident.attribute") < order.index("ident.cli")
+    assert (
+        order.index("ident.graybox")
+        < order.index("ident.torque_fit")
+        < order.index("ident.attribute")
+        < order.index("ident.cli")
+    )
 
 
 @pytest.mark.parametrize(
     ("below", "above"),
     [
-        ({"ident.graybox", "ident.inverse", "ident.extended"}, {"ident.problem", "ident.torque_fit", "ident.screening"}),
-        ({"ident.problem", "ident.weights", "ident.costs", "ident.derivatives", "ident.torque_fit"}, {"ident.screening", "ident.evidence"}),
-        ({"ident.screening", "ident.refits", "ident.search", "ident.strong", "ident.rounds"}, {"ident.attribute", "ident.trust", "ident.gain"}),
+        (
+            {"ident.graybox", "ident.inverse", "ident.extended"},
+            {"ident.problem", "ident.torque_fit", "ident.screening"},
+        ),
+        (
+            {"ident.problem", "ident.weights", "ident.costs", "ident.derivatives", "ident.torque_fit"},
+            {"ident.screening", "ident.evidence"},
+        ),
+        (
+            {"ident.screening", "ident.refits", "ident.search", "ident.strong", "ident.rounds"},
+            {"ident.attribute", "ident.trust", "ident.gain"},
+        ),
         ({"ident.attribute", "ident.conclude", "ident.diagnosis"}, {"ident.show", "ident.convert", "ident.cli"}),
         ({"ident.frf", "ident.estimate"}, {"ident.torque_fit", "ident.attribute"}),
     ],
@@ -85,7 +102,9 @@ def test_lower_layers_know_nothing_of_higher_ones(below, above):
 def test_every_module_stands_in_a_table_and_imports_none_of_a_later_one():
     text = (ROOT / "ARCHITECTURE.md").read_text().split("## Import rules")[0]
     tables = text.split("| module | content |")[1:]
-    rows = [(i, row.split("|")[1]) for i, table in enumerate(tables) for row in table.splitlines() if row.startswith("| `")]
+    rows = [
+        (i, row.split("|")[1]) for i, table in enumerate(tables) for row in table.splitlines() if row.startswith("| `")
+    ]
     place = {f"ident.{name.rstrip('/')}": i for i, cell in rows for name in re.findall(r"`([\w/]+)`", cell)}
 
     def at(module: str) -> int:

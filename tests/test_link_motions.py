@@ -28,7 +28,8 @@ def motions(robot, seed, hidden, folder):
     ]
     roles = ("identification", "identification", "validation")
     moves = tuple(
-        replace(p.trajectories[0], name=f"motion-{k}", role=role) for k, (p, role) in enumerate(zip(plans, roles, strict=True))
+        replace(p.trajectories[0], name=f"motion-{k}", role=role)
+        for k, (p, role) in enumerate(zip(plans, roles, strict=True))
     )
     drives = draw_drives(np.random.default_rng(seed), robot)
     plan = replace(plans[0], experiments=(), trajectories=moves)
@@ -138,6 +139,8 @@ def test_filters_of_drives_and_sensors_leave_the_noise_of_all_outputs_a_covarian
     problem = linked(still).problem
     problem = replace(problem, q_std=np.full(6, 1e-5), tau_std=np.full(6, 0.05))
     h = next(h for h in catalogue(problem.structure) if (h.effect, h.place) == (effect, "elbow_joint"))
-    model = Model(problem.structure, problem.nominal, (Effect(h, np.array([3.0 if effect == "torque_constant" else 5e-3])),))
+    model = Model(
+        problem.structure, problem.nominal, (Effect(h, np.array([3.0 if effect == "torque_constant" else 5e-3])),)
+    )
     weights = make_weights(problem, predictions(problem, model, [None] * len(problem.groups), steps=None), 0.0)
     assert all(np.linalg.eigvalsh(S).min() > 0.0 for S in weights.covariance)

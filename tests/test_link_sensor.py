@@ -16,7 +16,11 @@ def test_a_late_link_encoder_is_named_and_no_other_cause(ur10, tmp_path, seed):
     place, delay = str(rng.choice(ur10.joint_names)), float(rng.uniform(5e-4, 4e-3))
     effect = make_effect("sensor_delay", place, delay=delay, channel="q_link")
     data = run_experiment(
-        small_plan(ur10, seed, levels=(1.0,), period=1000), [effect], seed=seed, drives=draw_drives(rng, ur10), link_encoders=True
+        small_plan(ur10, seed, levels=(1.0,), period=1000),
+        [effect],
+        seed=seed,
+        drives=draw_drives(rng, ur10),
+        link_encoders=True,
     )
     verdict = diagnose(through_files(data, tmp_path))
     assert [(c.effect, c.joint, c.channel) for c in verdict.causes] == [("sensor_delay", place, "q_link")]
@@ -26,5 +30,7 @@ def test_a_late_link_encoder_is_named_and_no_other_cause(ur10, tmp_path, seed):
 
 def test_link_encoders_on_time_are_not_named(ur10, tmp_path):
     drives = draw_drives(np.random.default_rng(13), ur10)
-    data = run_experiment(small_plan(ur10, 13, levels=(1.0,), period=1000), [], seed=13, drives=drives, link_encoders=True)
+    data = run_experiment(
+        small_plan(ur10, 13, levels=(1.0,), period=1000), [], seed=13, drives=drives, link_encoders=True
+    )
     assert not diagnose(through_files(data, tmp_path)).causes

@@ -36,11 +36,24 @@ def frf_of(n, damping, frequency):
     A, B, C = plant(n, damping)
     w = 2 * np.pi * frequency
     z = np.exp(1j * w / RATE)[:, None, None]
-    return -(w**2)[:, None, None] * (C @ np.linalg.solve(z * np.eye(len(A)) - A, np.broadcast_to(B, (len(w), *B.shape))))
+    return -(w**2)[:, None, None] * (
+        C @ np.linalg.solve(z * np.eye(len(A)) - A, np.broadcast_to(B, (len(w), *B.shape)))
+    )
 
 
 def recorded(
-    robot, n, *, period=4096, periods=1, transient=0, experiments=1, noise=0.0, damping=0.02, band=(1.0, 30.0), seed=0, warm=False
+    robot,
+    n,
+    *,
+    period=4096,
+    periods=1,
+    transient=0,
+    experiments=1,
+    noise=0.0,
+    damping=0.02,
+    band=(1.0, 30.0),
+    seed=0,
+    warm=False,
 ):
     """Multisines that excite all inputs at all lines of a band, from rest; noise relative to the motion."""
     rng = np.random.default_rng(seed)
@@ -67,9 +80,21 @@ def recorded(
             x = A @ x + B @ (torque + 5.0 * disturbed[t, 2])
         segments.append(
             Segment(
-                f"e{e + 1}", "multisine", "identification", np.arange(N) / RATE, u, q, r=np.tile(r, (periods, 1)),
-                operating_point="p", q0=np.zeros(n), period=period, periods=periods, transient_periods=transient,
-                experiment=e + 1, realization=1, excited_lines=lines,
+                f"e{e + 1}",
+                "multisine",
+                "identification",
+                np.arange(N) / RATE,
+                u,
+                q,
+                r=np.tile(r, (periods, 1)),
+                operating_point="p",
+                q0=np.zeros(n),
+                period=period,
+                periods=periods,
+                transient_periods=transient,
+                experiment=e + 1,
+                realization=1,
+                excited_lines=lines,
             )
         )
     joints = tuple(robot.joint_names)

@@ -60,13 +60,15 @@ def test_what_happened_in_a_long_gap_is_not_made_up(tmp_path):
             with pytest.raises(DataError, match="without a sample after 5 s"):
                 convert_logs([log], "twomass", given)
         else:
-            assert convert_logs([log], "twomass", given, say=said.append).segments[0].n_samples == len(t) + round(gap * RATE)
+            assert convert_logs([log], "twomass", given, say=said.append).segments[0].n_samples == len(t) + round(
+                gap * RATE
+            )
             assert "the longest 305 ms" in said[0]
 
 
 def test_periods_that_are_held_out_are_not_fitted_to(tmp_path):
     _t, q = motion()
-    part = "[[multisine.part]]\nfirst = {}\nlast = {}\nrole = \"{}\"\n"
+    part = '[[multisine.part]]\nfirst = {}\nlast = {}\nrole = "{}"\n'
     text = '[columns]\ntau_1 = "tau"\nq_1 = "q"\n[multisine]\nperiod = 400\nexcited_lines = [3, 5]\n'
     for first, refused in ((3, True), (5, False)):
         both = part.format(first, 8, "validation") + part.format(1, 4, "identification")
@@ -86,7 +88,9 @@ def test_texts_of_other_encodings_and_decimal_signs(tmp_path, encoding, delimite
     (tmp_path / "log.csv").write_text(text + "\n", encoding=encoding)
     found = list_signals(tmp_path / "log.csv")
     assert sorted(found) == ["Moment [Nm]", "Winkel [°]"]
-    assert np.allclose(found["Winkel [°]"][:3], [0.0, 1.5, 2.0]) and np.allclose(found["Moment [Nm]"][:3], [1.0, -2.25, 0.03])
+    assert np.allclose(found["Winkel [°]"][:3], [0.0, 1.5, 2.0]) and np.allclose(
+        found["Moment [Nm]"][:3], [1.0, -2.25, 0.03]
+    )
 
 
 def motions(torque):
@@ -97,9 +101,20 @@ def motions(torque):
         t, q = motion(seed=k)
         a = np.gradient(np.gradient(q, 1 / RATE), 1 / RATE)
         tau = torque((joint.motor_inertia + 0.00477) * a, rng)
-        segments.append(Segment(f"m{k}", "trajectory", role, t, tau[:, None], q[:, None] + 1e-7 * rng.normal(size=(t.size, 1))))
+        segments.append(
+            Segment(f"m{k}", "trajectory", role, t, tau[:, None], q[:, None] + 1e-7 * rng.normal(size=(t.size, 1)))
+        )
     return Dataset(
-        "moves", "twomass", bench, RATE, bench.joint_names, "none", np.array([1e-7]), np.array([1e-3]), None, tuple(segments)
+        "moves",
+        "twomass",
+        bench,
+        RATE,
+        bench.joint_names,
+        "none",
+        np.array([1e-7]),
+        np.array([1e-3]),
+        None,
+        tuple(segments),
     )
 
 
@@ -129,9 +144,20 @@ def test_a_window_is_seen_as_the_transform_sees_it():
 
 def test_a_gain_of_some_joints_tells_of_all_of_them():
     before, after, noise = (np.array([[x, 16.0], [3.0 * x, 16.0]]) for x in (2.0, 0.5, 0.125))
-    gain = measure_gain(Errors(("a", "b"), before, after, noise), {"one": "N", "two": "N m"}, [0], "method", np.random.default_rng(0))
-    assert gain.joints == ("one",) and gain.metric.endswith(", N") and gain.of_some and gain.before == pytest.approx(2.0) and gain.after == pytest.approx(1.0)
-    assert [(g.before, g.after) for g in gain.by_joint.values()] == [pytest.approx((2.0, 1.0)), pytest.approx((4.0, 4.0))]
+    gain = measure_gain(
+        Errors(("a", "b"), before, after, noise), {"one": "N", "two": "N m"}, [0], "method", np.random.default_rng(0)
+    )
+    assert (
+        gain.joints == ("one",)
+        and gain.metric.endswith(", N")
+        and gain.of_some
+        and gain.before == pytest.approx(2.0)
+        and gain.after == pytest.approx(1.0)
+    )
+    assert [(g.before, g.after) for g in gain.by_joint.values()] == [
+        pytest.approx((2.0, 1.0)),
+        pytest.approx((4.0, 4.0)),
+    ]
     assert gain.over_all == pytest.approx((np.sqrt(10.0), np.sqrt(8.5)))
 
 
@@ -209,11 +235,19 @@ def stored(array, **options):
 MEMBERS = {
     "twice": (("x.npy", "x.npy"), stored(np.ones(100)), "x twice"),
     "structures": (("x.npy",), stored(np.zeros(100, [("a", float)])), "x is no array of numbers but of structures"),
-    "pickled": (("x.npy",), stored(np.array([1, None] * 50, object), allow_pickle=True), "x is an array of Python objects"),
+    "pickled": (
+        ("x.npy",),
+        stored(np.array([1, None] * 50, object), allow_pickle=True),
+        "x is an array of Python objects",
+    ),
     "texts": (("x.npy",), stored(np.array(["a"] * 100)), "x is no array of numbers but of texts"),
     "complex": (("x.npy",), stored(np.ones(100) * 1j), "x is no array of numbers but of complex numbers"),
     "three dimensions": (("x.npy",), stored(np.ones((100, 3, 4))), "3 dimensions, 100 x 3 x 4"),
-    "no header": (("x.npy",), b"\x93NUMPY\x01\x00\x76\x00" + b"{'descr': object()}".ljust(117) + b"\n", "x is unreadable"),
+    "no header": (
+        ("x.npy",),
+        b"\x93NUMPY\x01\x00\x76\x00" + b"{'descr': object()}".ljust(117) + b"\n",
+        "x is unreadable",
+    ),
 }
 
 
@@ -232,19 +266,30 @@ def test_members_of_an_archive_that_are_no_numbers_are_named(tmp_path, kind):
         assert "tau" in list_signals(tmp_path / "log.npz")
 
 
-@pytest.mark.parametrize(("row", "date"), [(0, "2026-13-45 10:00:00.000"), (777, "2026-02-30 10:00:07.770"), (777, "2026-01-31 25:00:07.770"), (777, "noon")])
+@pytest.mark.parametrize(
+    ("row", "date"),
+    [(0, "2026-13-45 10:00:00.000"), (777, "2026-02-30 10:00:07.770"), (777, "2026-01-31 25:00:07.770"), (777, "noon")],
+)
 def test_a_date_that_is_none_of_the_calendar_is_named_with_its_row(tmp_path, row, date):
     texts = [f"2026-01-31 10:00:{k / 100:06.3f}" for k in range(1000)]
     texts[row] = date
     (tmp_path / "log.csv").write_text("t,tau,q\n" + "\n".join(f"{t},1,2" for t in texts) + "\n")
-    (tmp_path / "map.toml").write_text('sample_rate = 100.0\n[time]\nsource = "t"\n[columns]\ntau_1 = "tau"\nq_1 = "q"\n')
+    (tmp_path / "map.toml").write_text(
+        'sample_rate = 100.0\n[time]\nsource = "t"\n[columns]\ntau_1 = "tau"\nq_1 = "q"\n'
+    )
     with pytest.raises(DataError, match=f"t = '{date}' in row {row + 1}, expected dates"):
         convert_logs([tmp_path / "log.csv"], "twomass", tmp_path / "map.toml")
 
 
-@pytest.mark.parametrize(("option", "refused"), [("scale = 1e-320", True), ("gear = 1e-300", True), ("scale = 1e-6", False)])
+@pytest.mark.parametrize(
+    ("option", "refused"), [("scale = 1e-320", True), ("gear = 1e-300", True), ("scale = 1e-6", False)]
+)
 def test_factors_that_leave_nothing_of_a_signal_are_refused(tmp_path, option, refused):
-    log, given = written(tmp_path, {"tau": motion()[1], "q": motion()[1]}, f'[columns]\ntau_1 = "tau"\nq_1 = {{ source = "q", {option} }}\n')
+    log, given = written(
+        tmp_path,
+        {"tau": motion()[1], "q": motion()[1]},
+        f'[columns]\ntau_1 = "tau"\nq_1 = {{ source = "q", {option} }}\n',
+    )
     if refused:
         with pytest.raises(DataError, match="q_1"):
             convert_logs([log], "twomass", given)

@@ -27,7 +27,10 @@ BENCH = '[columns]\ntau_1 = "u"\nq_1 = "x"\n'
 
 
 def written(path: Path, columns: dict, delimiter: str = ",", above: str = "", below: str = "") -> Path:
-    rows = "\n".join(delimiter.join(x if isinstance(x, str) else f"{x:.15g}" for x in row) for row in zip(*columns.values(), strict=True))
+    rows = "\n".join(
+        delimiter.join(x if isinstance(x, str) else f"{x:.15g}" for x in row)
+        for row in zip(*columns.values(), strict=True)
+    )
     path.write_text(f"{above}{delimiter.join(columns)}\n{below}{rows}\n", encoding="utf-8")
     return path
 
@@ -64,12 +67,19 @@ def test_dates_need_no_unit_in_the_map(tmp_path, kind):
         np.savez(log, when=np.array(texts) if "texts" in kind else stamps, **signals)
     else:
         log = tmp_path / "log.parquet"
-        pq.write_table(pa.table({"when": pa.array(texts) if kind == "texts" else pa.array(stamps, pa.timestamp("us"))} | signals), log)
+        pq.write_table(
+            pa.table({"when": pa.array(texts) if kind == "texts" else pa.array(stamps, pa.timestamp("us"))} | signals),
+            log,
+        )
     for unit in ("", 'unit = "ms"\n'):  # one that does not fit dates is not asked
         (tmp_path / "map.toml").write_text(f'sample_rate = {RATE}\n[time]\nsource = "when"\n{unit}{BENCH}')
         (s,) = convert_logs([log], "twomass", tmp_path / "map.toml").segments
-        assert np.allclose(s.t, T, atol=1e-9) and np.allclose(s.q[:, 0], Q[:, 0], atol=1e-12) and np.allclose(s.tau[:, 0], TAU[:, 0])
-    (tmp_path / "map.toml").write_text(f'sample_rate = {RATE}\n{BENCH.replace("x", "when")}')
+        assert (
+            np.allclose(s.t, T, atol=1e-9)
+            and np.allclose(s.q[:, 0], Q[:, 0], atol=1e-12)
+            and np.allclose(s.tau[:, 0], TAU[:, 0])
+        )
+    (tmp_path / "map.toml").write_text(f"sample_rate = {RATE}\n{BENCH.replace('x', 'when')}")
     with pytest.raises(DataError, match="when is no array of numbers"):
         convert_logs([log], "twomass", tmp_path / "map.toml")
 
@@ -94,7 +104,9 @@ ABOVE = {"nothing": "", "comments": "# robot 7\n# rate: 500, Hz\n\n", "a spreads
 
 
 @pytest.mark.parametrize("above", ABOVE)
-@pytest.mark.parametrize(("suffix", "delimiter"), [(".csv", ";"), (".csv", ","), (".txt", "\t"), (".txt", " "), (".dat", ";")])
+@pytest.mark.parametrize(
+    ("suffix", "delimiter"), [(".csv", ";"), (".csv", ","), (".txt", "\t"), (".txt", " "), (".dat", ";")]
+)
 def test_comments_above_the_names_and_units_below_are_read(tmp_path, above, suffix, delimiter):
     if above == "a spreadsheet" and delimiter != ";":
         pytest.skip("the first line names another delimiter")
@@ -108,7 +120,11 @@ def test_comments_above_the_names_and_units_below_are_read(tmp_path, above, suff
         assert list(found) == names and np.allclose(found["b3"], 1e3 * TAU[:, 3], rtol=1e-12)
         guessed, data = converted(log)
         columns = tomllib.loads(guessed.text)["columns"]
-        assert columns["q_2"]["unit"] == "deg" and columns["tau_6"]["unit"] == "mN m" and tomllib.loads(guessed.text)["time"]["unit"] == "ms"
+        assert (
+            columns["q_2"]["unit"] == "deg"
+            and columns["tau_6"]["unit"] == "mN m"
+            and tomllib.loads(guessed.text)["time"]["unit"] == "ms"
+        )
         assert np.allclose(whole(data, "q"), Q) and np.allclose(whole(data, "tau"), TAU)
 
 
@@ -158,7 +174,11 @@ def test_a_map_is_guessed_from_units_in_brackets_and_names_in_quotes(tmp_path, p
 
 def test_columns_of_other_stems_are_taken_in_their_order_and_said_to_be(tmp_path):
     names = ["base", "arm", "forearm", "roll", "pitch", "yaw"]
-    signals = {"t": T} | {f"{k}_angle": Q[:, j] for j, k in enumerate(names)} | {f"{k}_torque": TAU[:, j] for j, k in enumerate(names)}
+    signals = (
+        {"t": T}
+        | {f"{k}_angle": Q[:, j] for j, k in enumerate(names)}
+        | {f"{k}_torque": TAU[:, j] for j, k in enumerate(names)}
+    )
     guessed, data = converted(written(tmp_path / "log.csv", signals))
     assert np.allclose(whole(data, "q"), Q) and np.allclose(whole(data, "tau"), TAU)
     assert guessed.text.count("EDIT? joints in the order of the columns") == 2
@@ -210,7 +230,9 @@ def test_arrays_of_structures_and_cells_of_matlab(tmp_path, kind):
     assert np.allclose(found[name], Q if "samples" in kind else Q[:, 2])
     _, data = converted(tmp_path / "log.mat")
     assert np.allclose(whole(data, "q"), Q) and np.allclose(whole(data, "tau"), TAU)
-    (tmp_path / "map.toml").write_text(f"sample_rate = {RATE}\n{BENCH.replace('x', name.split('(')[0].split('{')[0].split('.')[0])}")
+    (tmp_path / "map.toml").write_text(
+        f"sample_rate = {RATE}\n{BENCH.replace('x', name.split('(')[0].split('{')[0].split('.')[0])}"
+    )
     with pytest.raises(DataError) as caught:
         convert_logs([tmp_path / "log.mat"], "twomass", tmp_path / "map.toml")
     assert name in str(caught.value).replace("(1)", "(3)").replace("{1}", "{3}")
@@ -223,11 +245,17 @@ def test_files_of_a_joint_each_with_clocks_of_their_own(tmp_path, damaged):
         t = 1e3 * T
         if damaged and j == 4:
             t[[500, 501]] = t[[501, 500]]
-        files.append(written(tmp_path / f"joint{j + 1}.csv", {"time_ms": t, "pos_deg": np.rad2deg(Q[:, j]), "torque_Nm": TAU[:, j]}))
+        files.append(
+            written(
+                tmp_path / f"joint{j + 1}.csv", {"time_ms": t, "pos_deg": np.rad2deg(Q[:, j]), "torque_Nm": TAU[:, j]}
+            )
+        )
     guessed, data = converted(files)
     assert np.allclose(whole(data, "q"), Q, atol=1e-9) and np.allclose(whole(data, "tau"), TAU, atol=1e-6)
     assert ("time" in guessed.found) != damaged
-    assert guessed.warnings == (("no time: joint5:time_ms goes back in row 502 (from 1002 to 1000)",) if damaged else ())
+    assert guessed.warnings == (
+        ("no time: joint5:time_ms goes back in row 502 (from 1002 to 1000)",) if damaged else ()
+    )
 
 
 @pytest.mark.parametrize("kind", ["list", "fixed list", "decimal", "list of decimals"])
@@ -235,11 +263,24 @@ def test_lists_and_decimals_of_parquet(tmp_path, kind):
     q, tau = np.round(Q, 6), np.round(TAU, 6)
     number = pa.decimal128(18, 6)
     if kind == "decimal":
-        columns = {f"{k}_{j + 1}": pa.array(x[:, j]).cast(number) for k, x in {"pos": q, "torque": tau}.items() for j in range(6)}
+        columns = {
+            f"{k}_{j + 1}": pa.array(x[:, j]).cast(number)
+            for k, x in {"pos": q, "torque": tau}.items()
+            for j in range(6)
+        }
     else:
-        of = {"list": pa.list_(pa.float64()), "fixed list": pa.list_(pa.float64(), 6), "list of decimals": pa.list_(number)}[kind]
+        of = {
+            "list": pa.list_(pa.float64()),
+            "fixed list": pa.list_(pa.float64(), 6),
+            "list of decimals": pa.list_(number),
+        }[kind]
         columns = {k: pa.array(list(x)).cast(of) for k, x in {"position": q, "effort": tau}.items()}
-    pq.write_table(pa.table({"timestamp": T, "name": [["a", "b"]] * N, "empty": pa.array([[]] * N, pa.list_(pa.float64()))} | columns), tmp_path / "log.parquet")
+    pq.write_table(
+        pa.table(
+            {"timestamp": T, "name": [["a", "b"]] * N, "empty": pa.array([[]] * N, pa.list_(pa.float64()))} | columns
+        ),
+        tmp_path / "log.parquet",
+    )
     _, data = converted(tmp_path / "log.parquet")
     assert np.allclose(whole(data, "q"), q, atol=1e-12) and np.allclose(whole(data, "tau"), tau, atol=1e-12)
 

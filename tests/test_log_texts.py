@@ -1,4 +1,5 @@
-"""Texts of numbers: cells that are none are named with their row, what no one needs stops nothing, and memory is bounded."""
+"""Texts of numbers: cells that are none are named with their row, what no one needs stops nothing, and memory is
+bounded."""
 
 import subprocess
 import sys
@@ -82,7 +83,16 @@ def test_commas_that_part_thousands_are_no_decimal_signs(tmp_path):
             converted(log)
 
 
-@pytest.mark.parametrize("cell", [lambda k: "" if k < 2500 else "STOP", lambda k: "0x1237", lambda k: "0" if k < 2500 else "E12", lambda k: "Größe", lambda k: ""])
+@pytest.mark.parametrize(
+    "cell",
+    [
+        lambda k: "" if k < 2500 else "STOP",
+        lambda k: "0x1237",
+        lambda k: "0" if k < 2500 else "E12",
+        lambda k: "Größe",
+        lambda k: "",
+    ],
+)
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
 def test_a_column_that_no_one_needs_stops_nothing(tmp_path, cell, encoding):
     text = "u,x,event\n" + "\n".join(rows(lambda k, r: f"{r},{cell(k)}")) + "\n"
@@ -98,7 +108,9 @@ def test_a_damaged_cell_is_told_by_the_survey_which_keeps_its_column(tmp_path):
     assert np.array_equal(np.flatnonzero(np.isnan(survey.signals["x"])), [2000])
 
 
-@pytest.mark.parametrize("above", ["Name;Scope\nFile;x.svdx\n\n", "Rate;1000\nCount;5\n\n", "a note\n# more\n", "# a comment\n" * 1100])
+@pytest.mark.parametrize(
+    "above", ["Name;Scope\nFile;x.svdx\n\n", "Rate;1000\nCount;5\n\n", "a note\n# more\n", "# a comment\n" * 1100]
+)
 def test_lines_of_a_program_above_the_header(tmp_path, above):
     log = written(tmp_path, rows(delimiter=";"), "u;x", above)
     assert np.array_equal(converted(log).tau[:, 0], X)
@@ -117,7 +129,9 @@ def test_a_header_that_is_a_comment_above_rows_with_texts(tmp_path):
 
 
 def test_rows_of_blanks_with_comments_between(tmp_path):
-    text = "# nothing\n" + "".join(f"  {x}\t {2 * x}  \n" + ("# more\n" if k % 100 == 3 else "") for k, x in enumerate(X))
+    text = "# nothing\n" + "".join(
+        f"  {x}\t {2 * x}  \n" + ("# more\n" if k % 100 == 3 else "") for k, x in enumerate(X)
+    )
     (tmp_path / "log.txt").write_text(text)
     assert np.allclose(list_signals(tmp_path / "log.txt")["values"], np.stack([X, 2 * X], axis=1))
     (tmp_path / "named.txt").write_text("u   x\n" + text.split("\n", 1)[1].replace("# more\n", ""))
@@ -157,7 +171,18 @@ def test_the_beginning_of_a_long_log_is_enough_for_a_guess(tmp_path, monkeypatch
 @pytest.mark.parametrize("quiet", [(), ("--quiet",), ("--json",)])
 def test_a_large_log_has_progress(tmp_path, monkeypatch, capfd, quiet):
     (tmp_path / "map.toml").write_text(MAP)
-    args = ["simgap", "convert", str(written(tmp_path, rows())), "--robot", "twomass", "--map", str(tmp_path / "map.toml"), "--out", str(tmp_path / "d"), *quiet]
+    args = [
+        "simgap",
+        "convert",
+        str(written(tmp_path, rows())),
+        "--robot",
+        "twomass",
+        "--map",
+        str(tmp_path / "map.toml"),
+        "--out",
+        str(tmp_path / "d"),
+        *quiet,
+    ]
     for size, told in ((1e3, not quiet), (1e9, False)):
         monkeypatch.setattr("ident.cli.LARGE_LOG", size)
         monkeypatch.setattr(sys, "argv", args)

@@ -120,14 +120,17 @@ def test_an_element_that_hardly_yields_is_followed_to_where_it_creeps(monkeypatc
 @pytest.mark.parametrize("name", ["hysteresis", "rounded hysteresis", "cable that yields"])
 @pytest.mark.parametrize("start", [0.0, 0.9, -0.6])
 def test_what_yields_begins_a_motion_where_it_is_told_to(name, start):
-    """Over what was recorded it follows its law from there; the return leads it back, which swings the arm no more than the law does."""
+    """Over what was recorded it follows its law from there; the return leads it back, which swings the arm no more than
+    the law does."""
     law = LAWS[name]._replace(start=start)
     X, recorded = free_motion(lines=6), 0.8
     h = steady_loop(law, in_time(X), in_time(1j * OMEGA * X), MODES, returns=recorded)
     x = in_time(X - compliance() * spectrum(h))
     _, a, b, k, exponent, recoil = law.shape
     spring, stiffness = (a, k) if law.code == kernels.CABLE else (0.0, a)
-    expected = spring * x + onward(np.diff(x, axis=1, prepend=x[:, -1:]), stiffness, b, exponent, recoil, np.full(len(x), start * b))
+    expected = spring * x + onward(
+        np.diff(x, axis=1, prepend=x[:, -1:]), stiffness, b, exponent, recoil, np.full(len(x), start * b)
+    )
     last = int(recorded * POINTS)
     assert np.std((h - expected)[:, :last]) < 5e-3 * np.std(expected)
     assert (h - spring * x)[:, -1] == pytest.approx(start * b, abs=1e-3 * b)
@@ -150,7 +153,15 @@ def test_modes_return_to_the_state_that_a_torque_repeats():
     assert z == pytest.approx(start, abs=1e-9 * np.abs(start).max())
 
 
-@given(st.floats(0, 1e3), st.floats(0, 50), st.floats(1e-6, 1), st.floats(-1, 1), st.floats(-3, 3), st.floats(0, 1e-3), st.floats(0, 1.0))
+@given(
+    st.floats(0, 1e3),
+    st.floats(0, 50),
+    st.floats(1e-6, 1),
+    st.floats(-1, 1),
+    st.floats(-3, 3),
+    st.floats(0, 1e-3),
+    st.floats(0, 1.0),
+)
 @settings(max_examples=300, deadline=None)
 def test_torque_of_a_cable_at_a_point(stiffness, friction, turn, q, v, dq, dv):
     h = kernels.link_point(stiffness, friction, turn, q, v, dq, dv)

@@ -20,13 +20,18 @@ LAWS = {"backlash": lambda k, d: [0.3 * d, 0.0], "softening_stiffness": lambda k
 
 @pytest.fixture(scope="module", params=LAWS)
 def noisy(request, clean):
-    """(problem, model, groups): a motion and the torque that a law answers it with, recorded with noise many times over."""
+    """(problem, model, groups): a motion and the torque that a law answers it with, recorded with noise many times
+    over."""
     problem = set_up(clean[0]).problem
     group, j = next(g for g in problem.groups if g.window is None), 0
     linear = Model(problem.structure, problem.nominal)
-    h = next(h for h in catalogue(problem.structure) if h.key == (request.param, problem.structure.robot.joint_names[j]))
+    h = next(
+        h for h in catalogue(problem.structure) if h.key == (request.param, problem.structure.robot.joint_names[j])
+    )
     deflection = group.to_time(predict(linear, group, problem.sampling).solution.delta[..., [j]]).std()
-    model = replace(linear, effects=(Effect(h, np.array(LAWS[request.param](problem.nominal.stiffness[j], deflection))),))
+    model = replace(
+        linear, effects=(Effect(h, np.array(LAWS[request.param](problem.nominal.stiffness[j], deflection))),)
+    )
     truth = predict(model, group, problem.sampling)
     rng, samples = np.random.default_rng(5), problem.samples(group)
     q_std, tau_std = 0.6 * NOISE * deflection, 1e-4 * np.abs(truth.U[:, 1:]).max()
@@ -73,7 +78,6 @@ def test_a_law_is_shown_the_signal_alone(noisy, monkeypatch):
     assert shown < 0.8 * off()
 
 
-
 def test_a_gear_within_its_dead_band_says_what_it_can(clean):
     """About a vertical axis nothing holds it there: its mean is free, and so no noise of it."""
     problem = set_up(clean[0]).problem
@@ -86,7 +90,8 @@ def test_a_gear_within_its_dead_band_says_what_it_can(clean):
 
 
 def test_what_else_is_at_the_joint_makes_no_noise_of_the_law(noisy):
-    """A hysteresis that never yields is a spring, and a drive with an effect keeps a law that was taken along the record a loop."""
+    """A hysteresis that never yields is a spring, and a drive with an effect keeps a law that was taken along the
+    record a loop."""
     problem, model, groups = noisy
     named, j = {h.key: h for h in catalogue(problem.structure)}, model.effects[0].hypothesis.joint
     place, k = problem.structure.robot.joint_names[j], problem.nominal.stiffness[j]
@@ -97,6 +102,8 @@ def test_what_else_is_at_the_joint_makes_no_noise_of_the_law(noisy):
 
     (law,) = model.effects
     constant = Effect(named["torque_constant", place], np.array([0.9]))
-    assert power((replace(law, hypothesis=along_record(law.hypothesis)), constant)) == pytest.approx(power((law, constant)), rel=1e-6)
+    assert power((replace(law, hypothesis=along_record(law.hypothesis)), constant)) == pytest.approx(
+        power((law, constant)), rel=1e-6
+    )
     spring = Effect(named["hysteresis", place], np.array([1e-3 * k, 1e6, 20.0, 0.0]))
     assert power((law, spring)) == pytest.approx(power((law,)), rel=0.1)

@@ -27,7 +27,14 @@ PARTS = "[multisine]\nperiod = 100\n[[multisine.part]]\nfirst = 1\nlast = 2\n"
 
 def written(folder, name="log.csv", **columns):
     columns = columns or {"t": T, "u": np.cos(3 * T), "x": np.sin(3 * T)}
-    np.savetxt(folder / name, np.stack(list(columns.values()), axis=1), header=",".join(columns), comments="", delimiter=",", fmt="%.12g")
+    np.savetxt(
+        folder / name,
+        np.stack(list(columns.values()), axis=1),
+        header=",".join(columns),
+        comments="",
+        delimiter=",",
+        fmt="%.12g",
+    )
     return folder / name
 
 
@@ -58,7 +65,11 @@ def mapped(folder, text):
         ('"x" }', '"x", index = 99 }', "x: .*found index = 99, expected no index, or 0: it has one column"),
         ('"x" }', '"x", plus = [{ source = "u", factor = 1.0, index = 7 }] }', "u: .*found index = 7"),
         ('"x" }', '"x" }\n[files]\na = { name = "log.csv", tim = "t" }', r"files\.a\.tim.*an unknown key"),
-        ('"x" }', '"x" }\n[roles]\nlgo = "validation"', r"\[roles\].*found lgo, which is none of the files given.*'log\.csv'"),
+        (
+            '"x" }',
+            '"x" }\n[roles]\nlgo = "validation"',
+            r"\[roles\].*found lgo, which is none of the files given.*'log\.csv'",
+        ),
         ('"x" }', '"x" }\n[roles]\nlog = "validation"\n"log.csv" = "identification"', "two roles of one log"),
     ],
 )
@@ -101,14 +112,23 @@ MIXED = """<robot name="mixed"><link name="a"/>
 def test_an_arm_of_both_kinds_of_joints_has_units_of_both(tmp_path):
     (tmp_path / "mixed.urdf").write_text(MIXED)
     write_robot(tmp_path / "mixed.urdf", tmp_path / "arm")
-    signals = {"t": T, "q1": np.sin(3 * T), "q2": 0.3 * np.cos(2 * T), "tau1": 9 * np.cos(3 * T), "tau2": 5 * np.sin(2 * T)}
+    signals = {
+        "t": T,
+        "q1": np.sin(3 * T),
+        "q2": 0.3 * np.cos(2 * T),
+        "tau1": 9 * np.cos(3 * T),
+        "tau2": 5 * np.sin(2 * T),
+    }
     log = written(tmp_path, **signals)
     text = guess_map([log], tmp_path / "arm").text
     columns = tomllib.loads(text)["columns"]
     assert [columns[k]["unit"] for k in ("q_1", "q_2", "tau_1", "tau_2")] == ["rad", "m", "N m", "N"]
     data = convert_logs([log], tmp_path / "arm", mapped(tmp_path, text))
     assert np.allclose(np.concatenate([s.q for s in data.segments])[:, 1], signals["q2"])
-    for wrong in (text.replace('"q2", unit = "m"', '"q2", unit = "rad"'), text.replace('"tau2", unit = "N"', '"tau2", unit = "N m"')):
+    for wrong in (
+        text.replace('"q2", unit = "m"', '"q2", unit = "rad"'),
+        text.replace('"tau2", unit = "N"', '"tau2", unit = "N m"'),
+    ):
         with pytest.raises(DataError, match="unit of"):
             convert_logs([log], tmp_path / "arm", mapped(tmp_path, wrong))
     geared = text.replace('"q2", unit = "m"', '"q2", unit = "rad", side = "motor"')

@@ -61,14 +61,19 @@ def test_softer_gears_move_gravity_and_inertia(moving):
 
 @pytest.fixture(scope="module")
 def yielding(moving):
-    """The problem as recorded with an element in a gear that yields and holds 0.6 of its limit where the motion begins, and that effect."""
+    """The problem as recorded with an element in a gear that yields and holds 0.6 of its limit where the motion begins,
+    and that effect."""
     problem, model, _ = moving
     h = next(h for h in catalogue(problem.structure) if h.key == ("hysteresis", "shoulder_lift_joint"))
     p = np.array([model.par.stiffness[1], 40.0, 20.0, 0.0, 0.6])
     true = replace(model, effects=(Effect(h, p),))
     (pred,) = predictions(problem, true, [None], steps=None)
     group = problem.groups[0]
-    return replace(problem, groups=(replace(group, U=group.U + pred.U, U_periods=group.U_periods + pred.U[:, None]),)), true, pred
+    return (
+        replace(problem, groups=(replace(group, U=group.U + pred.U, U_periods=group.U_periods + pred.U[:, None]),)),
+        true,
+        pred,
+    )
 
 
 def test_what_an_element_holds_where_a_motion_begins_is_felt(yielding):
@@ -105,7 +110,9 @@ def eccentric(moving):
     true = replace(model, effects=(Effect(hidden, np.array([8e-3, -6e-3])),))
     (pred,) = predictions(problem, true, [None], steps=None)
     group = problem.groups[0]
-    return replace(problem, groups=(replace(group, U=group.U + pred.U, U_periods=group.U_periods + pred.U[:, None]),)), true
+    return replace(
+        problem, groups=(replace(group, U=group.U + pred.U, U_periods=group.U_periods + pred.U[:, None]),)
+    ), true
 
 
 def test_a_fit_of_a_position_error_ends_where_it_is(eccentric):
@@ -119,7 +126,8 @@ def test_a_fit_of_a_position_error_ends_where_it_is(eccentric):
 
 
 def test_a_position_error_is_screened_with_what_it_moves(eccentric):
-    """At its own joint first, and with a start that is nearly right: gravity and inertia beside a constant posture would not do."""
+    """At its own joint first, and with a start that is nearly right: gravity and inertia beside a constant posture
+    would not do."""
     problem, true = eccentric
     baseline = fit(problem, replace(true, effects=()), iterations=1, hold=1e6)
     preds = predictions(problem, baseline.model, baseline.remainders)
@@ -131,7 +139,8 @@ def test_a_position_error_is_screened_with_what_it_moves(eccentric):
 
 @pytest.mark.parametrize(("hold", "folded"), [("none", 0.2), ("zoh", 0.2), ("none", 0.02)])
 def test_torque_of_a_faster_loop_that_folds_into_a_log_is_noise(ur10, hold, folded):
-    """Ten times the noise that is given circulates between the samples: of a torque that is held it is a torque as any other."""
+    """Ten times the noise that is given circulates between the samples: of a torque that is held it is a torque as any
+    other."""
     data = motion(ur10, 2, folded, hold)
     loud = hold == "none" and folded > 0.1
     assert set_up(data).problem.tau_std == pytest.approx(np.full(ur10.n, folded if loud else 0.02), rel=0.1)

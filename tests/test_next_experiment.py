@@ -27,7 +27,12 @@ def fitted(clean):
         model = Model(setup.problem.structure, baseline.model.par, (Effect(h, np.array(p, float)),))
         return h, fit(setup.problem, model, iterations=0, remainders=baseline.remainders)
 
-    return setup.problem, baseline, with_effect("hardening_stiffness", 1e9), with_effect("coulomb_friction", 0.2, 0.0, 1e-3)
+    return (
+        setup.problem,
+        baseline,
+        with_effect("hardening_stiffness", 1e9),
+        with_effect("coulomb_friction", 0.2, 0.0, 1e-3),
+    )
 
 
 def option(problem, factor, shift=0.0):
@@ -48,7 +53,9 @@ def test_what_the_drives_can_take_up_does_not_separate(fitted):
     stiffer = replace(baseline, model=replace(baseline.model, par=replace(par, stiffness=1.01 * par.stiffness)))
 
     def separation(known):
-        return _separation(problem, option(problem, 1.0), *(replace(x, information=known * x.information) for x in (stiffer, baseline)))
+        return _separation(
+            problem, option(problem, 1.0), *(replace(x, information=known * x.information) for x in (stiffer, baseline))
+        )
 
     assert 0 < separation(1e-6) < 0.05 * separation(1e6)
 
@@ -70,7 +77,9 @@ def test_the_plan_is_one_that_the_arm_can_run(fitted, tmp_path):
     assert found.nats > 5
     plan_to_toml(found.plan, tmp_path / "next_plan.toml")
     again, robot = plan_from_toml(tmp_path / "next_plan.toml"), problem.structure.robot
-    assert {e.operating_point for e in again.experiments} == {"op01"} and len({e.amplitude for e in again.experiments}) == 3
+    assert {e.operating_point for e in again.experiments} == {"op01"} and len(
+        {e.amplitude for e in again.experiments}
+    ) == 3
     q0 = again.experiments[0].q0
     assert np.all(q0 > robot.q_min) and np.all(q0 < robot.q_max)
 
@@ -84,6 +93,10 @@ def test_a_sure_cause_asks_for_nothing(fitted):
 @pytest.mark.parametrize(("axes", "there"), [(6, "postures"), (1, "positions of the axis")])
 def test_advice_asks_for_what_the_robot_can_do(axes, there):
     other = SimpleNamespace(effect="payload", joint="flange")
-    doubtful, sure = (SimpleNamespace(effect="cogging", joint="j", probability=p, alternatives=(other,)) for p in (0.6, 0.95))
-    assert f"two more {there}" in advice((doubtful,), True, axes) and "cogging from payload at j" in advice((doubtful,), True, axes)
+    doubtful, sure = (
+        SimpleNamespace(effect="cogging", joint="j", probability=p, alternatives=(other,)) for p in (0.6, 0.95)
+    )
+    assert f"two more {there}" in advice((doubtful,), True, axes) and "cogging from payload at j" in advice(
+        (doubtful,), True, axes
+    )
     assert f"two more {there}" in advice((sure,), True, axes) and advice((sure,), False, axes) is None

@@ -1,4 +1,5 @@
-"""Noise of the torque where no period repeats: differences of samples tell what circulates in the loop too; a residual is never less than noise."""
+"""Noise of the torque where no period repeats: differences of samples tell what circulates in the loop too; a residual
+is never less than noise."""
 
 from dataclasses import replace
 
@@ -68,7 +69,8 @@ def motions(ur10, tmp_path_factory):
 
 
 def test_a_guess_far_above_what_motions_leave_is_lowered_to_that(motions, ur10):
-    """Fourth differences of a torque that moves an arm are more than those of its sensor; what a model leaves in the band is not."""
+    """Fourth differences of a torque that moves an arm are more than those of its sensor; what a model leaves in the
+    band is not."""
     guessed, (setup, _), true = set_up(motions).problem.tau_std, identify(motions), ur10.array("tau_std")
     assert np.all(guessed[:3] > 8.0 * true[:3])
     assert np.all(guessed[:2] > 8.0 * setup.problem.tau_std[:2])
@@ -92,9 +94,12 @@ def test_causes_are_sought_again_where_they_hid_how_little_noise_there_is(motion
 
 
 def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints(ur10, tmp_path_factory):
-    """One period of a multisine: noise of the positions is correlated over the torques of the joints, and most of it at high lines."""
+    """One period of a multisine: noise of the positions is correlated over the torques of the joints, and most of it at
+    high lines."""
     plan = small_plan(ur10, 32, points=2, periods=2, transient_periods=1)
-    data = replace(through_files(run_experiment(plan, seed=32), tmp_path_factory.mktemp("one")), q_std=None, tau_std=None)
+    data = replace(
+        through_files(run_experiment(plan, seed=32), tmp_path_factory.mktemp("one")), q_std=None, tau_std=None
+    )
     last = [replace(s, periods=1, transient_periods=0, **s.part(slice(-s.period, None))) for s in data.segments]
     data = replace(data, segments=tuple(last))  # the transient tells it otherwise
     true = ur10.array("tau_std")
@@ -108,7 +113,9 @@ def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints
 def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tmp_path_factory, monkeypatch, coloured):
     """A ripple shows at lines that nothing excites as at the others; what is still left there beside it is noise."""
     plan = small_plan(ur10, 35, points=2, periods=2, transient_periods=1)
-    data = replace(through_files(run_experiment(plan, seed=35), tmp_path_factory.mktemp("raised")), q_std=None, tau_std=None)
+    data = replace(
+        through_files(run_experiment(plan, seed=35), tmp_path_factory.mktemp("raised")), q_std=None, tau_std=None
+    )
     last = [replace(s, periods=1, transient_periods=0, **s.part(slice(-s.period, None))) for s in data.segments]
     data = replace(data, segments=tuple(last))
     setup, told = identify(data)  # the model with what was found

@@ -16,7 +16,9 @@ NAMES = sorted(p.name for p in FOLDER.glob("*.ipynb"))
 def test_notebook_runs(name):
     notebook = nbformat.read(FOLDER / name, as_version=4)
     assert any("assert" in c.source for c in notebook.cells if c.cell_type == "code")
-    NotebookClient(notebook, timeout=400, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}).execute()
+    NotebookClient(
+        notebook, timeout=400, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}
+    ).execute()
 
 
 @pytest.mark.parametrize("name", NAMES)

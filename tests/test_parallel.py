@@ -124,7 +124,9 @@ def test_linear_algebra_starts_no_threads_within_what_users_call(function):
             seen.extend(x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas")
             raise Asked
 
-    needed = [p for p in signature(function).parameters.values() if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+    needed = [
+        p for p in signature(function).parameters.values() if p.default is p.empty and p.kind is not p.VAR_KEYWORD
+    ]
     with threadpool_limits(2), pytest.raises(Asked):
         function(**{p.name: Probe() for p in needed})
     assert seen and set(seen) == {1}

@@ -14,7 +14,9 @@ def with_period(data, period):
     """The records as they are, said to repeat after another number of samples."""
     count = PERIODS * PERIOD // period
     cut = [
-        replace(s, period=period, periods=count, **s.part(slice(0, count * period))) for s in data.segments if s.kind == "multisine"
+        replace(s, period=period, periods=count, **s.part(slice(0, count * period)))
+        for s in data.segments
+        if s.kind == "multisine"
     ]
     return replace(data, segments=tuple(cut))
 
@@ -34,7 +36,11 @@ def test_periods_that_repeat_are_not_told():
     """Neither where a motor sticks most of the time, nor a multiple of the period, nor with noise near the signal."""
     data, _ = sticking()
     assert not unrepeated(data)
-    noisy = replace(data.segments[0], q=data.segments[0].q + 0.2 * np.std(data.segments[0].q) * np.random.default_rng(0).normal(size=data.segments[0].q.shape))
+    noisy = replace(
+        data.segments[0],
+        q=data.segments[0].q
+        + 0.2 * np.std(data.segments[0].q) * np.random.default_rng(0).normal(size=data.segments[0].q.shape),
+    )
     assert not period_warnings(noisy, data)
     single = with_period(data, PERIODS * PERIOD)
     assert not any(period_warnings(s, single) for s in single.segments)

@@ -32,10 +32,17 @@ def test_rest_sags_by_torque_over_stiffness(ur10):
 
 
 @pytest.mark.parametrize(
-    "hidden", [None, "hardening_stiffness:cubic=2e9", "softening_stiffness:low_stiffness=8e3,transition=5e-4", "backlash:gap=1e-3"]
+    "hidden",
+    [
+        None,
+        "hardening_stiffness:cubic=2e9",
+        "softening_stiffness:low_stiffness=8e3,transition=5e-4",
+        "backlash:gap=1e-3",
+    ],
 )
 def test_friction_by_load_sees_all_that_the_gear_carries(ur10, hidden):
-    """The torque of the gear that friction by load grows with is the one that the simulator puts on the link, whatever law it has."""
+    """The torque of the gear that friction by load grows with is the one that the simulator puts on the link, whatever
+    law it has."""
     place = "elbow_joint"
     effects = [] if hidden is None else [parse_effect(f"{hidden.split(':')[0]}@{place}:{hidden.split(':')[1]}", ur10)]
     plant = build_plant(ur10, effects)
@@ -45,15 +52,22 @@ def test_friction_by_load_sees_all_that_the_gear_carries(ur10, hidden):
         data.qpos[plant.motor[j]], data.qvel[plant.motor[j]] = wind_up, rate
         mujoco.mj_forward(plant.model, data)
         on_link = data.qfrc_spring[plant.link[j]] + data.qfrc_damper[plant.link[j]]
-        q, v, q_link, v_link = (x[None] for x in (data.qpos[plant.motor], data.qvel[plant.motor], data.qpos[plant.link], data.qvel[plant.link]))
+        q, v, q_link, v_link = (
+            x[None]
+            for x in (data.qpos[plant.motor], data.qvel[plant.motor], data.qpos[plant.link], data.qvel[plant.link])
+        )
         state = State(np.zeros(1), q, v, q_link, v_link, q, v, q_link)
         assert load(state) == pytest.approx([on_link], rel=1e-9, abs=1e-9)
 
 
 def test_an_error_of_the_transmission_goes_through_the_law_of_the_gear(ur10):
-    """Motor and link feel the law at the wind-up with the error in it, and the motor the slope of the error too (virtual work)."""
+    """Motor and link feel the law at the wind-up with the error in it, and the motor the slope of the error too
+    (virtual work)."""
     place, cubic, size, n = "elbow_joint", 2e9, 2e-3, 40.0
-    effects = (make_effect("hardening_stiffness", place, cubic=cubic), make_effect("transmission_error", place, amplitude=size, periods_per_rev=n, phase=0.3))
+    effects = (
+        make_effect("hardening_stiffness", place, cubic=cubic),
+        make_effect("transmission_error", place, amplitude=size, periods_per_rev=n, phase=0.3),
+    )
     plant = build_plant(ur10, effects)
     j, rest_of = ur10.joint_names.index(place), np.zeros((1, ur10.n))
     q, v = rest_of.copy(), rest_of.copy()
@@ -76,20 +90,29 @@ def test_the_turn_of_a_dry_friction_is_solved(asked, size):
     assert x + size * np.tanh(x) == pytest.approx(asked, rel=1e-6, abs=1e-6)
 
 
-@pytest.mark.parametrize("hidden", ["coulomb_friction@wrist_2_joint:torque=4,asymmetry=0.2", "dress_pack@wrist_2_joint:stiffness=5,friction=4"])
+@pytest.mark.parametrize(
+    "hidden",
+    ["coulomb_friction@wrist_2_joint:torque=4,asymmetry=0.2", "dress_pack@wrist_2_joint:stiffness=5,friction=4"],
+)
 def test_dry_friction_does_not_depend_on_the_step(ur10, hidden):
-    """A wrist that creeps within the turn of its friction, which the step passes many times: a fine step says the same."""
+    """A wrist that creeps within the turn of its friction, which the step passes many times: a fine step says the
+    same."""
     plan = small_plan(ur10, 1, points=1, levels=(0.2,), validation_points=0, period=300, periods=2, band_hz=(4.0, 40.0))
     free, coarse, fine = (
         np.stack([s.q[:, 4] for s in run_experiment(plan, effects, noise=0.0, timestep=step).segments])
-        for effects, step in (([], 1e-4), ([parse_effect(hidden, ur10)], 2.5e-4), ([parse_effect(hidden, ur10)], 2.5e-5))
+        for effects, step in (
+            ([], 1e-4),
+            ([parse_effect(hidden, ur10)], 2.5e-4),
+            ([parse_effect(hidden, ur10)], 2.5e-5),
+        )
     )
     assert np.std(coarse - fine) < 0.01 * np.std(free - fine)
     assert np.std(np.diff(coarse) * 1e3) < 0.05  # rad/s
 
 
 def test_a_motor_thrown_into_friction_comes_to_rest(ur10):
-    """Without other torque: the friction of a step is twenty times what turns its sign, and no velocity is left but of the turn."""
+    """Without other torque: the friction of a step is twenty times what turns its sign, and no velocity is left but of
+    the turn."""
     h, start = 1e-4, 0.01
     inertia = np.ones((1, ur10.n))
     size = 20.0 * REVERSAL * 2.0 / h
@@ -105,7 +128,18 @@ def test_a_motor_thrown_into_friction_comes_to_rest(ur10):
 
 def test_two_masses_resonate_where_they_should():
     robot = load_robot("twomass")
-    plan = small_plan(robot, 0, points=1, levels=(1.0,), validation_points=0, sample_rate=2500.0, period=2500, band_hz=(20.0, 120.0), periods=4, transient_periods=2)
+    plan = small_plan(
+        robot,
+        0,
+        points=1,
+        levels=(1.0,),
+        validation_points=0,
+        sample_rate=2500.0,
+        period=2500,
+        band_hz=(20.0, 120.0),
+        periods=4,
+        transient_periods=2,
+    )
     drives = {"damping": np.array([2e-3]), "viscous_friction": np.array([1e-3])}
     s = run_experiment(plan, drives=drives, noise=0.0, timestep=1e-4).segments[0]
     U, Y = (np.fft.rfft(s.periodic(c)[0, :, 0])[s.excited_lines] for c in ("tau", "q"))
@@ -134,7 +168,9 @@ def test_steady_state_is_reached_after_the_transient(clean):
 @pytest.mark.parametrize("name", sorted(EFFECTS))
 def test_every_effect_changes_the_data_and_stays_bounded(name):
     robot = load_robot("ur10")
-    plan = small_plan(robot, 1, points=1, levels=(1.0,), validation_points=0, period=500, periods=2, band_hz=(2.0, 60.0))
+    plan = small_plan(
+        robot, 1, points=1, levels=(1.0,), validation_points=0, period=500, periods=2, band_hz=(2.0, 60.0)
+    )
     peak = np.max([np.abs(e.r).max(axis=0) for e in plan.experiments], axis=0)
     effect = draw_effect(
         np.random.default_rng(3), robot, names=(name,), place=valid_places(name, robot)[0], peak_torque=peak
@@ -200,7 +236,9 @@ def test_a_simulation_that_diverges_is_an_error(ur10):
         run_experiment(small_plan(ur10, 1, points=1, levels=(1.0,), period=200), [broken])
 
 
-@pytest.mark.parametrize("hidden", ["joint_coupling@wrist_2_joint:ratio=0.3", "gravity_spring@elbow_joint:stiffness=300,rest_angle=1.0"])
+@pytest.mark.parametrize(
+    "hidden", ["joint_coupling@wrist_2_joint:ratio=0.3", "gravity_spring@elbow_joint:stiffness=300,rest_angle=1.0"]
+)
 def test_motions_are_followed_whatever_is_hidden(ur10, hidden):
     plan = small_plan(ur10, 1, points=1, levels=(1.0,), validation_points=0, period=500, periods=2, trajectory=True)
     data = run_experiment(plan, [parse_effect(hidden, ur10)], noise=0.0)

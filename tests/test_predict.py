@@ -103,7 +103,9 @@ def test_state_space_is_the_impedance_and_its_sampled_frf(pair):
     f = np.array([0.7, 4.0, 15.0, 60.0])
     eye = np.eye(len(space.A))
     for w, Z in zip(2 * np.pi * f, impedance(structure, par, lin, 2j * np.pi * f)[0], strict=True):
-        np.testing.assert_allclose(np.linalg.solve(1j * w * eye - space.continuous, space.gain)[:2], np.linalg.inv(Z), rtol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.solve(1j * w * eye - space.continuous, space.gain)[:2], np.linalg.inv(Z), rtol=1e-9
+        )
     G, _ = sampled_frf(structure, par, lin, f, TS, "zoh")
     for w, g in zip(2 * np.pi * f, G, strict=True):
         exact = -(w**2) * np.linalg.solve(np.exp(1j * w * TS) * eye - space.A, space.B)[:2]
@@ -158,7 +160,15 @@ def test_extended_filter_predicts_the_whole_arm_of_another_engine(pair):
 def test_runs_that_begin_in_motion_are_predicted_from_there(pair):
     """The second experiment of one long recording follows the first without a stop."""
     plan = plan_experiment(
-        pair, Q0[None], points=1, validation_points=0, levels=(1.0,), period=PERIOD, periods=2, transient_periods=0, trajectory=False
+        pair,
+        Q0[None],
+        points=1,
+        validation_points=0,
+        levels=(1.0,),
+        period=PERIOD,
+        periods=2,
+        transient_periods=0,
+        trajectory=False,
     )
     schedule = schedule_plan(plan)
     runs = runs_of(cut_recording(run_recording(schedule, seed=3), schedule))
@@ -187,7 +197,9 @@ def test_particle_likelihood_converges_to_the_kalman_one(twomass):
     exact = gaussian(innovations(k, runs.u[0], y[0])[None], k.Lambda[None, None]).log_likelihood
     spread = {}
     for particles in (100, 1600):
-        draws = [particle_filter(structure, runs, particles=particles, seed=s)(par, noise).log_likelihood for s in range(12)]
+        draws = [
+            particle_filter(structure, runs, particles=particles, seed=s)(par, noise).log_likelihood for s in range(12)
+        ]
         spread[particles] = np.std(draws, ddof=1)
         # The likelihood is unbiased, so its logarithm lies low by half its variance (Pitt et al. 2012).
         error = np.mean(draws) + 0.5 * spread[particles] ** 2 - exact
@@ -213,7 +225,19 @@ def test_a_remainder_is_stepped_to_second_order(pair):
         s = stepper(structure, par, noise, Q0, h)
         x = (s.x0 + np.repeat([0.0, 0.3], 4))[None]
         for _ in range(round(0.08 / h)):
-            x, _, _ = _step(along_z(chain_of(structure.model)), x, s.u0[None] + 20.0, s.x0, s.u0, s.A, s.B, s.hold, s.rise, s.springs, s.flat)
+            x, _, _ = _step(
+                along_z(chain_of(structure.model)),
+                x,
+                s.u0[None] + 20.0,
+                s.x0,
+                s.u0,
+                s.A,
+                s.B,
+                s.hold,
+                s.rise,
+                s.springs,
+                s.flat,
+            )
         ends.append(x[0])
     errors = [np.linalg.norm(x[:4] - ends[-1][:4]) for x in ends[:-1]]
     assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3
@@ -258,7 +282,9 @@ def test_information_of_prediction_errors_is_that_of_frf_matching(pair):
     # The innovation covariance changes with the parameters too: what that tells is no part of FRF matching.
     e, S = predict(par, noise).innovations, kalman(space, noise, TS).Lambda
     root = np.linalg.inv(np.linalg.cholesky(S))
-    J = np.stack([((predict(par.with_log(x + 1e-5 * d), noise).innovations - e) / 1e-5 @ root.T).ravel() for d in np.eye(8)])
+    J = np.stack(
+        [((predict(par.with_log(x + 1e-5 * d), noise).innovations - e) / 1e-5 @ root.T).ravel() for d in np.eye(8)]
+    )
     s = 2j * np.pi * lines / (PERIOD * TS)
     G, dG = sampled_frf(structure, par, lin, lines / (PERIOD * TS), TS, "zoh", derivatives=True)
     U = np.swapaxes(np.fft.rfft(u[:, -PERIOD:], axis=1)[:, lines], 0, 1).swapaxes(1, 2)
@@ -288,12 +314,19 @@ def test_prediction_errors_and_frfs_give_the_same_estimates_and_cover_the_truth(
         u, y = simulated(space, noise, r, rng, LOOP)
         runs = Runs(u, y + Q0, np.zeros(2, int), Q0[None], 3 * PERIOD, TS)
         fit = fit_prediction(
-            local_predictor(structure, runs), structure, par, Noise(5 * noise.process, 2 * noise.measurement), fitted=names
+            local_predictor(structure, runs),
+            structure,
+            par,
+            Noise(5 * noise.process, 2 * noise.measurement),
+            fitted=names,
         )
         assert fit.converged
         # FRFs of the same samples, with the covariance that the noise gives them.
         s = 2j * np.pi * lines / (PERIOD * TS)
-        U, Y = (np.fft.rfft(v[:, 3 * PERIOD :].reshape(2, periods, PERIOD, 2).mean(axis=1), axis=1)[:, lines] for v in (u, y))
+        U, Y = (
+            np.fft.rfft(v[:, 3 * PERIOD :].reshape(2, periods, PERIOD, 2).mean(axis=1), axis=1)[:, lines]
+            for v in (u, y)
+        )
         U, Y = (v.transpose(1, 2, 0) for v in (U, Y))
         h = H / s[:, None, None] ** 2
         Phi = PERIOD / periods * (h * noise.process**2 @ np.conj(np.swapaxes(h, 1, 2)) + np.diag(noise.measurement**2))

@@ -51,7 +51,8 @@ def rigid_motion(role: str, seed: int) -> tuple[pin.Model, Motion]:
 
 
 def test_a_rigid_arm_with_friction_is_left_with_its_noise():
-    """Of white noise the band of 5 Hz holds 5 %; a sign between samples, which the low pass rounds off, is about as much."""
+    """Of white noise the band of 5 Hz holds 5 %; a sign between samples, which the low pass rounds off, is about as
+    much."""
     model, train = rigid_motion("identification", 1)
     held_out = rigid_motion("validation", 2)[1]
     assert train.band_hz == pytest.approx(5.0)
@@ -75,7 +76,9 @@ def test_references_are_compared_as_the_gain_is(emps):
     rms = np.sqrt((lines[0] + 2.0 * lines[1:].sum()) / group.window_share)
     found = references(emps, EMPS_DATA)
     assert found.band_hz == pytest.approx(10.0)
-    assert held_out.rms(held_out.tau)[0] == pytest.approx(rms, rel=1e-3) and found.size[0] == pytest.approx(rms, rel=1e-3)
+    assert held_out.rms(held_out.tau)[0] == pytest.approx(rms, rel=1e-3) and found.size[0] == pytest.approx(
+        rms, rel=1e-3
+    )
     theirs = next(r for r in found.found if r.published)
     assert theirs.over_all == pytest.approx(1.808, abs=0.01)
     assert all(r.over_all == pytest.approx(theirs.over_all, rel=0.01) for r in found.found)

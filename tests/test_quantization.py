@@ -16,7 +16,9 @@ from sim.experiment import plan_experiment
 
 def motion(rng, N=4000):
     t = np.arange(N) / 1000
-    return 0.8 + sum(a * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for a, f in ((0.01, 2.25), (4e-3, 5.5), (1e-3, 11.0)))
+    return 0.8 + sum(
+        a * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for a, f in ((0.01, 2.25), (4e-3, 5.5), (1e-3, 11.0))
+    )
 
 
 @pytest.mark.parametrize("step", [2e-5, 6.1e-5, 2 * np.pi / 2**16])
@@ -38,7 +40,8 @@ def test_a_smooth_position_with_noise_has_no_steps(seed):
 
 
 def lines_of_rounding(cells, middle, slope):
-    """Power of the error of odd multisines of so many steps about one place in a step, over that of white errors: what it is, and as
+    """Power of the error of odd multisines of so many steps about one place in a step, over that of white errors: what
+    it is, and as
     it is foretold from the rounded record; (2, top)."""
     rng = np.random.default_rng(3)
     N, top, step, draws = 4000, 280, 1e-4, 40
@@ -57,7 +60,9 @@ def lines_of_rounding(cells, middle, slope):
     return np.stack([actual, foretold]) / (draws * step**2 / 12 / N)
 
 
-@pytest.mark.parametrize(("cells", "middle", "slope"), [(9.0, 0.0, 0.5), (20.0, 0.25, 1.0), (60.0, 0.13, 1.0), (60.0, 0.13, 0.5)])
+@pytest.mark.parametrize(
+    ("cells", "middle", "slope"), [(9.0, 0.0, 0.5), (20.0, 0.25, 1.0), (60.0, 0.13, 1.0), (60.0, 0.13, 0.5)]
+)
 def test_what_steps_leave_in_lines_is_foretold_from_the_rounded_motion(cells, middle, slope):
     both = lines_of_rounding(cells, middle, slope)
     for band in (slice(5, 60), slice(60, 280)):
@@ -78,10 +83,16 @@ def test_a_joint_within_one_step_has_white_errors():
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_beside_an_encoder_in_steps_nothing_is_left_but_noise(tmp_path, seed):
-    """A loop that hunts between steps of 45 times the encoder's noise, at two levels: chi-square stays that of noise."""
+    """A loop that hunts between steps of 45 times the encoder's noise, at two levels: chi-square stays that of
+    noise."""
     robot = load_robot("ur10")
     plan = plan_experiment(
-        robot, operating_points(robot, 2, np.random.default_rng(seed)), points=2, seed=seed, levels=(1.0, 0.4), period=4000
+        robot,
+        operating_points(robot, 2, np.random.default_rng(seed)),
+        points=2,
+        seed=seed,
+        levels=(1.0, 0.4),
+        period=4000,
     )
     hidden = EFFECTS["encoder_quantization"](place="shoulder_lift_joint", resolution=9e-5)
     save_dataset(run_experiment(plan, [hidden], seed=seed), tmp_path / "d")
@@ -93,7 +104,9 @@ def test_beside_an_encoder_in_steps_nothing_is_left_but_noise(tmp_path, seed):
 def test_what_circulates_in_the_loop_is_no_rounding_that_averages_out(tmp_path):
     """Positions differ from period to period by more than their errors do: at joint 2 of the IRB by twice as much."""
     robot = load_robot("irb")
-    plan = plan_experiment(robot, operating_points(robot, 2, np.random.default_rng(4)), points=1, seed=4, levels=(1.0, 0.3), period=2000)
+    plan = plan_experiment(
+        robot, operating_points(robot, 2, np.random.default_rng(4)), points=1, seed=4, levels=(1.0, 0.3), period=2000
+    )
     hidden = EFFECTS["encoder_quantization"](place="joint_2", resolution=3.6e-5)
     save_dataset(run_experiment(plan, [hidden], seed=4), tmp_path / "d")
     data = load_dataset(tmp_path / "d")

@@ -52,7 +52,9 @@ def test_the_whole_path_on_real_data(bench):
 def test_a_map_or_log_that_does_not_fit_is_one_clear_error(tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("a,b\n" + "1,2\n3,4\n" * 8)
-    text = 'sample_rate = 100.0\n[columns]\ntau_1 = { source = "a", unit = "N m" }\nq_1 = { source = "%s", unit = "%s" }\n'
+    text = (
+        'sample_rate = 100.0\n[columns]\ntau_1 = { source = "a", unit = "N m" }\nq_1 = { source = "%s", unit = "%s" }\n'
+    )
     for source, unit, found in (("c", "rad", "no c"), ("b", "parsec", "parsec")):
         (tmp_path / "map.toml").write_text(text % (source, unit))
         with pytest.raises(DataError, match=found):
@@ -86,7 +88,13 @@ def named(verdict):
         ("emps_drive", "emps", ["DATA_EMPS.mat"], 2, 0.25),
         ("kuka_kr300_dual_encoder", "kr300", None, 2, 0.45),
         ("ur10_unisa", "ur10_bare", None, 2, 0.35),
-        ("panda_gaz_ral2019", "panda_bare", [f"exciting_traj_{x}.txt" for x in ("positions", "time", "torques", "velocity")], 1, 0.5),
+        (
+            "panda_gaz_ral2019",
+            "panda_bare",
+            [f"exciting_traj_{x}.txt" for x in ("positions", "time", "torques", "velocity")],
+            1,
+            0.5,
+        ),
         ("staubli_tx40", "tx40", None, 2, 0.4),
     ],
 )

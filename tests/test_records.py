@@ -46,7 +46,8 @@ def test_the_return_of_a_motion_goes_on_with_its_acceleration(noise):
 
 @pytest.mark.parametrize("seconds", [4.0, 15.0])
 def test_noise_of_a_motion_costs_as_much_as_it_counts(seconds):
-    """White noise of the torque alone, whitened: as many squares as numbers are compared, however short the motion is."""
+    """White noise of the torque alone, whitened: as many squares as numbers are compared, however short the motion
+    is."""
     bench = load_robot("twomass")
     rng = np.random.default_rng(1)
     t = np.arange(int(seconds * RATE)) / RATE
@@ -72,10 +73,11 @@ def test_noise_of_a_motion_costs_as_much_as_it_counts(seconds):
 
 
 def moves_with_dwells(size, scale=1.0, asymmetry=0.0):
-    """Moves from point to point with dwells, in each of which dry friction of a ``size`` happens to balance another torque.
+    """Moves from point to point with dwells, in each of which dry friction of a ``size`` happens to balance another
+    torque.
 
-    The torque that is recorded is the one delivered over ``scale``. Friction is ``1 + asymmetry`` times its size forwards, and
-    ``1 - asymmetry`` times backwards.
+    The torque that is recorded is the one delivered over ``scale``. Friction is ``1 + asymmetry`` times its size
+    forwards, and ``1 - asymmetry`` times backwards.
     """
     bench, rng = load_robot("twomass"), np.random.default_rng(3)
     fs, n = 500.0, 150
@@ -90,7 +92,9 @@ def moves_with_dwells(size, scale=1.0, asymmetry=0.0):
     q, friction = np.concatenate(q), np.concatenate(friction)
     v, joint = np.gradient(q, 1 / fs), bench.joints[0]
     inertia = joint.motor_inertia + 0.00477
-    tau = (inertia * np.gradient(v, 1 / fs) + joint.viscous_friction * v + friction) / scale + 0.02 * rng.normal(size=len(q))
+    tau = (inertia * np.gradient(v, 1 / fs) + joint.viscous_friction * v + friction) / scale + 0.02 * rng.normal(
+        size=len(q)
+    )
     cut = 250 * 20
     motions = [
         Segment(name=name, role=role, kind="trajectory", t=np.arange(len(q[part])) / fs, tau=tau[part, None], q=q[part, None] + 1e-7 * rng.normal(size=(len(q[part]), 1)))
@@ -145,7 +149,8 @@ def test_friction_that_drifts_balances_at_rest_what_is_asked_of_it(monkeypatch):
 
 @pytest.mark.parametrize("scale", [0.5, 1.6])
 def test_friction_at_rest_balances_what_the_drive_delivers(scale):
-    """A drive that delivers another torque than is recorded: at the true figures no more is left than with a right one."""
+    """A drive that delivers another torque than is recorded: at the true figures no more is left than with a right
+    one."""
 
     def left(scale):
         setup = set_up(moves_with_dwells(0.8, scale))
@@ -182,8 +187,12 @@ def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     t = np.arange(int(6 * fs)) / fs
     q, tau = 0.2 * np.sin(2 * np.pi * 0.7 * t), 3.0 * np.sin(2 * np.pi * 0.7 * t + 0.5)
     rng = np.random.default_rng(1)
-    segment = Segment("m", "trajectory", "identification", t, tau[:, None] + 1e-3 * rng.normal(size=(t.size, 1)), q[:, None])
-    data = Dataset("cut", "twomass", bench, fs, bench.joint_names, "zoh", np.array([1e-6]), np.array([1e-3]), None, (segment,))
+    segment = Segment(
+        "m", "trajectory", "identification", t, tau[:, None] + 1e-3 * rng.normal(size=(t.size, 1)), q[:, None]
+    )
+    data = Dataset(
+        "cut", "twomass", bench, fs, bench.joint_names, "zoh", np.array([1e-6]), np.array([1e-3]), None, (segment,)
+    )
     setup = set_up(data)
     (group,) = setup.problem.groups
     motion = predict(Model(setup.problem.structure, setup.problem.nominal), group, setup.problem.sampling).motion(group)
@@ -192,7 +201,8 @@ def test_limits_of_the_torque_are_sought_below_what_was_recorded():
 
 
 def periodic_positions():
-    """Records of the two masses whose lines fall from far above the noise to far below it, and none beyond; and their truth."""
+    """Records of the two masses whose lines fall from far above the noise to far below it, and none beyond; and their
+    truth."""
     bench, rng, n = load_robot("twomass"), np.random.default_rng(2), 2000
     lines = np.arange(1, 200)
     size = np.where(lines < 150, 1e-3 * np.exp(-lines / 18.0), 0.0)
@@ -208,7 +218,18 @@ def periodic_positions():
                 operating_point="a", q0=np.zeros(1), period=n, periods=3, excited_lines=np.arange(1, 100),
             )
         )  # fmt: skip
-    data = Dataset("lines", "twomass", bench, RATE, bench.joint_names, "zoh", np.array([noise]), np.array([0.1]), None, tuple(segments))
+    data = Dataset(
+        "lines",
+        "twomass",
+        bench,
+        RATE,
+        bench.joint_names,
+        "zoh",
+        np.array([noise]),
+        np.array([0.1]),
+        None,
+        tuple(segments),
+    )
     (group,) = build_groups(data)
     return data, group, np.stack(truth)[:, : group.Q.shape[1], None]
 

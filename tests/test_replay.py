@@ -29,7 +29,13 @@ def drive_data(*effects, noise=0.1, trajectory=False, validation=1):
     """A two-inertia drive that moves far beyond its noise."""
     robot = load_robot("twomass")
     postures = operating_points(robot, 1 + validation, np.random.default_rng(1))
-    options = {"points": 1, "validation_points": validation, "levels": (20.0, 8.0), "period": 1000, "trajectory": trajectory}
+    options = {
+        "points": 1,
+        "validation_points": validation,
+        "levels": (20.0, 8.0),
+        "period": 1000,
+        "trajectory": trajectory,
+    }
     plan = plan_experiment(robot, postures, seed=1, **options)
     return run_experiment(plan, effects, seed=1, noise=noise)
 
@@ -51,7 +57,9 @@ def test_the_impedance_of_the_file_is_that_of_the_model():
     """Differences of integration steps against the matrices of the gray-box, images of the hold apart."""
     robot = load_robot("ur10")
     posture = operating_points(robot, 1, np.random.default_rng(0))
-    data = run_experiment(plan_experiment(robot, posture, points=1, validation_points=0, levels=(1.0,), period=500, trajectory=False))
+    data = run_experiment(
+        plan_experiment(robot, posture, points=1, validation_points=0, levels=(1.0,), period=500, trajectory=False)
+    )
     setup = set_up(data)
     model, group = Model(setup.problem.structure, setup.problem.nominal), setup.problem.groups[0]
     arm = load_arm(export_baseline(model), robot.joint_names, setup.problem.sampling.sample_time)

@@ -102,7 +102,9 @@ def test_every_coordinate_is_a_body_that_can_be(x):
     moments = np.linalg.eigvalsh(_pseudo(p[0]))
     assert p[0, 0] > 0 and moments[0] > -1e-12 * moments[-1]
     steps = 1e-6 * np.eye(10)
-    change = [(_inertias(root[None], np.array(x) + e)[0] - _inertias(root[None], np.array(x) - e)[0])[0] / 2e-6 for e in steps]
+    change = [
+        (_inertias(root[None], np.array(x) + e)[0] - _inertias(root[None], np.array(x) - e)[0])[0] / 2e-6 for e in steps
+    ]
     assert np.allclose(slope[0], np.array(change).T, atol=1e-5 * max(1.0, np.abs(p).max()))
 
 
@@ -118,7 +120,10 @@ def test_links_that_are_not_as_described_are_found(moved, ur10):
         data = structure.model.createData()
         torques.append(np.array([pin.rnea(structure.model, data, *x) for x in zip(q, v, a, strict=True)]))
     described, fitted, true = torques
-    true, fitted, described = (x + p * a for x, p in ((true, problem.nominal.inertia), (fitted, found.par.inertia), (described, problem.nominal.inertia)))
+    true, fitted, described = (
+        x + p * a
+        for x, p in ((true, problem.nominal.inertia), (fitted, found.par.inertia), (described, problem.nominal.inertia))
+    )
     error, gap = (np.sqrt(np.mean((x - true) ** 2, axis=0)) for x in (fitted, described))
     assert np.all(error[1:] < 0.1 * gap[1:])
 
@@ -142,9 +147,15 @@ def test_inertias_that_foretell_what_was_left_out_are_told_from_those_that_only_
 
 def test_a_hinge_across_a_joint_keeps_the_inertia_that_was_found(ur10):
     own = build_structure(ur10)
-    heavy = {n: pin.Inertia(2 * own.model.inertias[i].mass, own.model.inertias[i].lever, own.model.inertias[i].inertia) for n, i in own.carriers.items()}
+    heavy = {
+        n: pin.Inertia(2 * own.model.inertias[i].mass, own.model.inertias[i].lever, own.model.inertias[i].inertia)
+        for n, i in own.carriers.items()
+    }
     hinge = Elasticity("bend", "elbow_joint", (1.0, 0.0, 0.0), 1e5, 10.0)
-    masses = [sum(x.mass for x in list(build_structure(ur10, elasticities=h, inertias=heavy).model.inertias)[1:]) for h in ((), (hinge,))]
+    masses = [
+        sum(x.mass for x in list(build_structure(ur10, elasticities=h, inertias=heavy).model.inertias)[1:])
+        for h in ((), (hinge,))
+    ]
     assert masses == pytest.approx([2 * sum(x.mass for x in list(own.model.inertias)[1:])] * 2)
 
 
@@ -159,8 +170,14 @@ def test_links_as_described_stay_as_they_are(ur10):
     v[:, 0] = 0.3 * np.cos(t)
     structure, par = build_structure(ur10), Parameters.nominal(ur10)
     data = structure.model.createData()
-    tau = np.array([pin.rnea(structure.model, data, *x) for x in zip(q, v, acc, strict=True)]) + par.inertia * acc + par.viscous * v
-    problem = set_up(dataset_of(ur10, Segment(name="m", role="identification", kind="trajectory", t=t, tau=tau, q=q))).problem
+    tau = (
+        np.array([pin.rnea(structure.model, data, *x) for x in zip(q, v, acc, strict=True)])
+        + par.inertia * acc
+        + par.viscous * v
+    )
+    problem = set_up(
+        dataset_of(ur10, Segment(name="m", role="identification", kind="trajectory", t=t, tau=tau, q=q))
+    ).problem
     found = fit_rigid(problem.structure, problem.nominal, problem.groups)
     for i in range(1, 7):
         assert found.structure.model.inertias[i].mass == pytest.approx(structure.model.inertias[i].mass, rel=0.05)
@@ -173,7 +190,9 @@ def test_the_end_of_a_single_motion_is_held_out(ur10):
     assert (first.role, end.role) == ("identification", "validation")
     assert np.array_equal(np.concatenate([first.q, end.q]), q) and np.array_equal(np.concatenate([first.t, end.t]), t)
     assert end.n_samples == pytest.approx(len(t) / 3, abs=1)
-    short = dataset_of(ur10, Segment(name="m", role="identification", kind="trajectory", t=t[:900], tau=tau[:900], q=q[:900]))
+    short = dataset_of(
+        ur10, Segment(name="m", role="identification", kind="trajectory", t=t[:900], tau=tau[:900], q=q[:900])
+    )
     assert with_held_out(short) is short
 
 
@@ -186,7 +205,9 @@ def test_friction_is_named_beside_links_that_differ_from_their_description(moved
     assert set(named) == set(result.joints)
     for joint, torque, offset in zip(result.joints, COULOMB, OFFSET, strict=True):
         assert named[joint].parameters["torque"].value == pytest.approx(torque, rel=0.05)
-        constant = verdict.baseline[f"torque_offset.{joint}"].value + torque * named[joint].parameters["asymmetry"].value
+        constant = (
+            verdict.baseline[f"torque_offset.{joint}"].value + torque * named[joint].parameters["asymmetry"].value
+        )
         assert constant == pytest.approx(offset, abs=0.1 + 0.02 * torque)
     assert verdict.gain.gap_closed > 0.95
     assert "inertias of 6 links" in verdict.notes[0] and verdict.baseline["mass.elbow_joint"].unit == "kg"
@@ -228,8 +249,12 @@ def test_inertias_are_kept_by_what_they_leave_of_fitted_and_of_held_out_motions(
 def test_links_are_doubted_where_much_is_left(left, unknown, asked):
     """Over noise and over a discrepancy of a million times that: laws of causes have errors."""
     counts = np.full(2, 100.0)
-    first, last = (SimpleNamespace(costs=x * counts, counts=counts, cost=2e2 * x, count=200.0, chi2_per_dof=x) for x in (1e6, left))
-    found = SimpleNamespace(baseline=first, final=last, detected=True, unknown=unknown, left_share=left_share(first, last))
+    first, last = (
+        SimpleNamespace(costs=x * counts, counts=counts, cost=2e2 * x, count=200.0, chi2_per_dof=x) for x in (1e6, left)
+    )
+    found = SimpleNamespace(
+        baseline=first, final=last, detected=True, unknown=unknown, left_share=left_share(first, last)
+    )
     assert unresolved(found) is asked
 
 
@@ -267,7 +292,9 @@ def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
     hidden = parse_effect("payload@flange:mass=4,com_x=0.02,com_y=0.03,com_z=0.1", ur10)
     drives = draw_drives(np.random.default_rng(2), ur10)
     plans = [replace(small_plan(ur10, seed, points=1, trajectory=True), experiments=()) for seed in (21, 22)]
-    parts = [run_experiment(plan, [hidden], seed=seed, drives=drives) for plan, seed in zip(plans, (21, 22), strict=True)]
+    parts = [
+        run_experiment(plan, [hidden], seed=seed, drives=drives) for plan, seed in zip(plans, (21, 22), strict=True)
+    ]
     roles = ("identification", "validation")
     motions = [replace(d.segments[0], name=f"m{i}", role=r) for i, (d, r) in enumerate(zip(parts, roles, strict=True))]
     data = replace(parts[0], segments=tuple(motions))
@@ -308,7 +335,8 @@ def test_a_ripple_that_a_motion_runs_over_is_not_trusted(moved):
 
 
 def test_a_ripple_is_sought_along_what_was_recorded_and_in_the_compared_band():
-    """628 periods a metre: a slow sweep shows them, fast moves do not, and the return that closes a motion is none of both."""
+    """628 periods a metre: a slow sweep shows them, fast moves do not, and the return that closes a motion is none of
+    both."""
     robot = load_robot("emps")
     rng = np.random.default_rng(5)
     t = np.arange(int(20 * RATE)) / RATE
@@ -317,9 +345,25 @@ def test_a_ripple_is_sought_along_what_was_recorded_and_in_the_compared_band():
         w, size = 2 * np.pi / period, 0.1
         q, v, a = size * np.sin(w * t), size * w * np.cos(w * t), -size * w**2 * np.sin(w * t)
         mass = robot.array("motor_inertia")[0] + 50.0
-        tau = mass * a + robot.array("viscous_friction")[0] * v + 8.0 * np.sin(628.0 * q + 0.7) + 0.5 * rng.normal(size=t.size)
-        segments.append(Segment(f"m{i}", "trajectory", "identification", t, tau[:, None], q[:, None] + 1e-6 * rng.normal(size=(t.size, 1))))
-    data = Dataset("sweep", "emps", robot, RATE, robot.joint_names, "zoh", np.array([1e-6]), np.array([0.5]), None, tuple(segments))
+        tau = (
+            mass * a
+            + robot.array("viscous_friction")[0] * v
+            + 8.0 * np.sin(628.0 * q + 0.7)
+            + 0.5 * rng.normal(size=t.size)
+        )
+        segments.append(
+            Segment(
+                f"m{i}",
+                "trajectory",
+                "identification",
+                t,
+                tau[:, None],
+                q[:, None] + 1e-6 * rng.normal(size=(t.size, 1)),
+            )
+        )
+    data = Dataset(
+        "sweep", "emps", robot, RATE, robot.joint_names, "zoh", np.array([1e-6]), np.array([0.5]), None, tuple(segments)
+    )
     setup, result = identify(data)
     preds = predictions(setup.problem, result.model, result.remainders)
     found = wave_numbers(setup.problem, preds, 0)

@@ -25,7 +25,12 @@ sizes = st.floats(-0.6, 0.6)
 def test_a_ripple_and_its_slope(sine, cosine, second, angle):
     value, slope = ripple(sine, cosine, np.array(second), np.array(angle))
     size = np.hypot(sine, cosine)
-    harmonics = [sine * np.sin(angle), cosine * np.cos(angle), size * second[0] * np.sin(2 * angle), size * second[1] * np.cos(2 * angle)]
+    harmonics = [
+        sine * np.sin(angle),
+        cosine * np.cos(angle),
+        size * second[0] * np.sin(2 * angle),
+        size * second[1] * np.cos(2 * angle),
+    ]
     assert value == pytest.approx(sum(harmonics), abs=1e-9)
     h = 1e-5
     ends = [ripple(sine, cosine, np.array(second), np.array(angle + d))[0] for d in (-h, h)]
@@ -57,11 +62,14 @@ class UnevenGear:
 
 def uneven_motor(robot, size):
     waves = [(size, 202.0, 0.0), (0.2 * size, 404.0, -1.0)]
-    return [parse_effect(f"cogging@elbow_joint:amplitude={a},periods_per_rev={n},phase={p}", robot) for a, n, p in waves]
+    return [
+        parse_effect(f"cogging@elbow_joint:amplitude={a},periods_per_rev={n},phase={p}", robot) for a, n, p in waves
+    ]
 
 
 def test_a_ripple_that_grows_with_the_torque_is_asked_for_in_advance(identified):
-    """What the decoy says is recorded gives what the motor delivers, once it ripples; its screening is the derivative."""
+    """What the decoy says is recorded gives what the motor delivers, once it ripples; its screening is the
+    derivative."""
     _, setup, result = identified
     problem, j = setup.problem, 2
     h = next(h for h in catalogue(problem.structure) if h.key == ("unknown:torque_ripple", "elbow_joint"))
@@ -101,7 +109,9 @@ def test_a_ripple_with_a_second_harmonic_is_one_cause(ur10, tmp_path, name):
     size = {"cogging": 6.0, "transmission_error": 5e-5}[name]
     effects = uneven_motor(ur10, size) if name == "cogging" else [UnevenGear("elbow_joint", size, 202.0, 0.2)]
     drives = draw_drives(np.random.default_rng(8), ur10)
-    data = run_experiment(small_plan(ur10, 8, points=1, levels=(1.0,), period=1000), effects, seed=8, drives=drives, timestep=5e-4)
+    data = run_experiment(
+        small_plan(ur10, 8, points=1, levels=(1.0,), period=1000), effects, seed=8, drives=drives, timestep=5e-4
+    )
     verdict = diagnose(through_files(data, tmp_path))
     assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.1] == [(name, "elbow_joint")]
     found = verdict.causes[0].parameters

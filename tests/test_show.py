@@ -66,7 +66,9 @@ HINGES = [
     cause("base_elasticity", "base", stiffness=5e5, damping=500.0, axis_x=1.0, axis_y=0.0, axis_z=0.0),
     cause("base_elasticity", "base", stiffness=4e5, damping=400.0, axis_x=0.0, axis_y=1.0, axis_z=0.0),
 ]
-BEFORE = cause("transverse_elasticity", "elbow_joint", stiffness=2e4, damping=20.0, axis_x=0.6, axis_y=0.0, axis_z=0.8, before=1.0)
+BEFORE = cause(
+    "transverse_elasticity", "elbow_joint", stiffness=2e4, damping=20.0, axis_x=0.6, axis_y=0.0, axis_z=0.8, before=1.0
+)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +91,10 @@ def test_the_exported_arm_linearises_to_the_matrices_of_the_model(robot_name, ca
     q_m = rng.uniform(-1, 1, robot.n)
     q = equilibrium(structure, par, q_m)
     lin = linearise(structure, q)
-    chain = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"body:{_exported(n, causes)}") for n in structure.model.names[1:]]
+    chain = [
+        mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"body:{_exported(n, causes)}")
+        for n in structure.model.names[1:]
+    ]
     coordinate = {structure.model.idx_vs[i + 1]: int(model.body_jntadr[b]) for i, b in enumerate(chain)}
     link = np.array([coordinate[c] for c in range(structure.n_coordinates)])
     motor = np.array([model.joint(f"motor:{j}").qposadr[0] for j in robot.joint_names])
@@ -219,8 +224,15 @@ def diagnosis(ur10):
     trace = TorqueTrace("op03", t, *(rng.normal(size=(len(t), 6)) for _ in range(3)), q)
     values = {k: Value(v, 0.01 * v, "SI") for k, v in parameters(ur10).items()}
     verdict = Verdict(
-        "a<b", values, Discrepancy(True, 0.0, 12.0, ()), (cause("coulomb_friction", "elbow_joint", torque=3.0),), 0.01,
-        "noise floor reached", Gain(("op03",), "RMS", 1.0, 0.1, 0.09, 0.98, (0.9, 0.99), "validation segments"), None, "It misses friction.",
+        "a<b",
+        values,
+        Discrepancy(True, 0.0, 12.0, ()),
+        (cause("coulomb_friction", "elbow_joint", torque=3.0),),
+        0.01,
+        "noise floor reached",
+        Gain(("op03",), "RMS", 1.0, 0.1, 0.09, 0.98, (0.9, 0.99), "validation segments"),
+        None,
+        "It misses friction.",
     )
     spectrum = SpectrumMap(np.linspace(0, 70, 9), *(rng.random((1, 6, 8)) + 0.1 for _ in range(3)), ("op01",))
     plot = EvidencePlot(0, "friction", "v", "tau", *(rng.normal(size=50) for _ in range(4)))
@@ -236,7 +248,15 @@ def test_all_outputs_are_written_whole(diagnosis, tmp_path):
     assert set(verdict) >= {"dataset", "baseline", "discrepancy", "causes", "unexplained", "gain", "next_experiment"}
     html = (tmp_path / "out" / "report.html").read_text()
     assert len(html) < 3e6 and not re.search("#0a0b[01]", html)
-    assert "It misses friction." in html and "a&lt;b" in html and "<svg" in html and "http://" not in html.replace("http://www.w3.org", "").replace("http://purl.org", "").replace("http://creativecommons.org", "")
+    assert (
+        "It misses friction." in html
+        and "a&lt;b" in html
+        and "<svg" in html
+        and "http://"
+        not in html.replace("http://www.w3.org", "")
+        .replace("http://purl.org", "")
+        .replace("http://creativecommons.org", "")
+    )
     toml = tomllib.loads((tmp_path / "out" / "model.toml").read_text())
     assert toml["effect"][0]["name"] == "coulomb_friction"
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml")).nu == 6
@@ -259,7 +279,10 @@ def test_torques_are_shown_at_the_joints_of_the_gain_first():
     measured = np.tile(np.sin(np.arange(50.0))[:, None], 6)
     errors = np.array([0.01, 0.5, 0.02, 0.4, 0.3, 0.03]) * measured
     trace = TorqueTrace("s", np.arange(50.0), measured, measured - errors, measured, measured)
-    shown = [[j for j in joints if f"<!-- {j} -->" in trace_figure(trace, joints, ("N m",) * 6, of)] for of in ((), ("c",), tuple("acf"))]
+    shown = [
+        [j for j in joints if f"<!-- {j} -->" in trace_figure(trace, joints, ("N m",) * 6, of)]
+        for of in ((), ("c",), tuple("acf"))
+    ]
     assert shown == [list("bde"), list("bcd"), list("acf")]
 
 

@@ -1,7 +1,7 @@
 """Motors that stick: friction of a set of values at rest, in periodic records.
 
-The bench is simulated here, apart from the plant of the project: two inertias on a spring, and friction at the motor that
-holds it as long as no more than its static size is asked, to the step (Karnopp 1985).
+The bench is simulated here, apart from the plant of the project: two inertias on a spring, and friction at the motor
+that holds it as long as no more than its static size is asked, to the step (Karnopp 1985).
 """
 
 from dataclasses import replace
@@ -73,7 +73,8 @@ def run_bench(reference, feed, coulomb, static, stribeck, q_noise, offset):
 
 @cache
 def sticking(static=COULOMB, seed=0):
-    """Records at two postures and three levels, those at a third posture held out; and the share of samples at rest, by segment."""
+    """Records at two postures and three levels, those at a third posture held out; and the share of samples at rest, by
+    segment."""
     bench, rng = load_robot("twomass"), np.random.default_rng(seed)
     lines = np.arange(1, 181)
     t, segments, shares = np.arange(PERIODS * PERIOD) / FS, [], {}
@@ -94,7 +95,18 @@ def sticking(static=COULOMB, seed=0):
                     operating_point=posture, q0=np.array([offset]), period=PERIOD, periods=PERIODS, amplitude=level, excited_lines=lines,
                 )
             )  # fmt: skip
-    data = Dataset("sticking", "twomass", bench, FS, bench.joint_names, "zoh", np.array([NOISE[0]]), np.array([NOISE[1]]), None, tuple(segments))
+    data = Dataset(
+        "sticking",
+        "twomass",
+        bench,
+        FS,
+        bench.joint_names,
+        "zoh",
+        np.array([NOISE[0]]),
+        np.array([NOISE[1]]),
+        None,
+        tuple(segments),
+    )
     return data, shares
 
 
@@ -103,7 +115,11 @@ def friction(effect, p):
     problem = set_up(sticking()[0]).problem
     h = next(h for h in catalogue(problem.structure) if h.effect == effect)
     par = replace(
-        problem.nominal, inertia=np.array([MOTOR]), stiffness=np.array([SPRING]), damping=np.array([DAMPER]), viscous=np.array([VISCOUS])
+        problem.nominal,
+        inertia=np.array([MOTOR]),
+        stiffness=np.array([SPRING]),
+        damping=np.array([DAMPER]),
+        viscous=np.array([VISCOUS]),
     )
     return problem, Model(problem.structure, par, (Effect(h, np.array(p)),))
 
@@ -196,12 +212,15 @@ def test_a_motor_that_creeps_is_periodic_but_for_a_line(creep):
 def test_a_drive_that_hunts_between_steps_of_its_encoder_does_not_creep():
     """Pulses here and there, of which some fall on the ends of the periods: most differences of samples are small."""
     rng, P, N = np.random.default_rng(2), 3, 4000
-    x = 0.01 * rng.normal(size=(P, N, 1)) + 20.0 * (rng.random((P, N, 1)) < 0.1) * rng.choice([-1.0, 1.0], size=(P, N, 1))
+    x = 0.01 * rng.normal(size=(P, N, 1)) + 20.0 * (rng.random((P, N, 1)) < 0.1) * rng.choice(
+        [-1.0, 1.0], size=(P, N, 1)
+    )
     assert np.array_equal(without_creep(x), x)
 
 
 def test_what_is_held_hangs_on_few_parameters(monkeypatch):
-    """Columns beside dry friction, against differences: far nearer to these than those of a motor that nothing holds."""
+    """Columns beside dry friction, against differences: far nearer to these than those of a motor that nothing
+    holds."""
     problem, model = friction("coulomb_friction", [COULOMB, 0.1, 1e-4])
     group = problem.groups[0]
     pred = predict(model, group, problem.sampling)
@@ -211,7 +230,15 @@ def test_what_is_held_hangs_on_few_parameters(monkeypatch):
         without.setattr("ident.derivatives.held", lambda *_: None)
         unaware = jacobian(problem, model, group, pred).dense()
     for c in (0, 2, 3, len(model.par.to_log()) + 1):
-        ends = [predict(unpack(model, x + s * 1e-4 * (np.arange(len(x)) == c), np.inf), group, problem.sampling, W=pred.solution.W).U for s in (1, -1)]
+        ends = [
+            predict(
+                unpack(model, x + s * 1e-4 * (np.arange(len(x)) == c), np.inf),
+                group,
+                problem.sampling,
+                W=pred.solution.W,
+            ).U
+            for s in (1, -1)
+        ]
         slope = (ends[0] - ends[1])[-1, : J.shape[1]] / 2e-4
         off[c] = [np.linalg.norm(X[-1, ..., c] - slope) / np.linalg.norm(slope) for X in (J, unaware)]
     assert all(near < 0.5 for near, _ in off.values()) and off[len(model.par.to_log()) + 1][0] < 1e-2
@@ -219,7 +246,8 @@ def test_what_is_held_hangs_on_few_parameters(monkeypatch):
 
 
 def test_noise_that_friction_takes_from_a_motor_at_rest_is_no_merit():
-    """Records of noise alone of a motor that stands still, of which friction takes a part: it costs as much as without."""
+    """Records of noise alone of a motor that stands still, of which friction takes a part: it costs as much as
+    without."""
     data, _ = sticking()
     rng = np.random.default_rng(6)
     still = [
@@ -261,7 +289,11 @@ def test_a_law_that_has_lost_what_sets_it_apart_is_its_special_case():
     def special(effect, p):
         return plainly_special(problem, model, Effect(laws[effect], np.array(p)))
 
-    assert [special("stribeck_friction", [2.0, static, 0.01, 1e-3]) for static in (1.7, 2.2, 2.4)] == [True, True, False]
+    assert [special("stribeck_friction", [2.0, static, 0.01, 1e-3]) for static in (1.7, 2.2, 2.4)] == [
+        True,
+        True,
+        False,
+    ]
     assert not special("coulomb_friction", [2.0, 0.0, 1e-3])
 
 
@@ -278,7 +310,8 @@ def test_a_dip_within_rest_is_none_beside_a_law_along_the_record():
 
 @pytest.mark.parametrize("begun", [1e-6, 0.1])
 def test_a_friction_that_sticks_is_found_from_either_side_of_what_is_seen(begun):
-    """Fits begun where it turns at once, and within a velocity that is seen: no step leads from the latter to the former."""
+    """Fits begun where it turns at once, and within a velocity that is seen: no step leads from the latter to the
+    former."""
     problem, model = friction("coulomb_friction", [COULOMB, 0.0, begun])
     preds = [predict(model, g, problem.sampling) for g in problem.groups]
     weights = make_weights(problem, preds, 0.0)

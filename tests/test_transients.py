@@ -15,7 +15,8 @@ PERIOD, TOP, STD = 4000, 300, 2e-3
 
 
 def record(seed, *, decay=0.0, steady=1, transient=1, period=PERIOD):
-    """A steady motion, a transient of a time constant of ``decay`` periods beside it, and white noise; of two joints."""
+    """A steady motion, a transient of a time constant of ``decay`` periods beside it, and white noise; of two
+    joints."""
     rng = np.random.default_rng(seed)
     t = np.arange((steady + transient) * period) / period
     motion = np.sum([np.sin(2 * np.pi * k * t + k * k) for k in range(1, 40, 2)], axis=0)
@@ -73,7 +74,8 @@ def test_the_likeliest_levels_are_those_of_the_noise(torque, lines):
 
 
 def test_few_lines_are_not_told_to_hold_no_noise():
-    """Of 14 lines of one record three hold more noise of the torque than of the position: likeliest may be a hundredth of it, or none."""
+    """Of 14 lines of one record three hold more noise of the torque than of the position: likeliest may be a hundredth
+    of it, or none."""
     rng = np.random.default_rng(7)
     gain = np.geomspace(0.5, 30.0, 14)[:, None, None]
     likeliest, taken = [], []
@@ -96,7 +98,15 @@ def test_the_levels_have_settled():
         """Of the negative log-likelihood by the logarithms of the levels, over the number of lines."""
         m = level[:2] + np.einsum("kij,j->ki", gain**2, level[2:])
         by_mean = (1.0 / m - power / m**2)[1:]
-        return np.concatenate([np.sum(by_mean * level[:2], axis=0), np.sum(by_mean * np.einsum("kij->ki", gain[1:] ** 2) * level[2:], axis=0)]) / 200
+        return (
+            np.concatenate(
+                [
+                    np.sum(by_mean * level[:2], axis=0),
+                    np.sum(by_mean * np.einsum("kij->ki", gain[1:] ** 2) * level[2:], axis=0),
+                ]
+            )
+            / 200
+        )
 
     assert LEVEL_STEPS >= 30 and np.abs(slope(level)).max() < 1e-4
 
@@ -135,7 +145,8 @@ def test_noise_of_an_arm_is_found_from_one_steady_period(identified, single):
     setup, baseline = identify(single)
     assert all(g.U_periods.shape[1] == 1 and g.shows_noise for g in setup.problem.groups)
     assert setup.problem.q_std == pytest.approx(whole.problem.q_std, rel=0.1)
-    # Torque noise shows above that of the positions in a few slow lines; differences of samples show what circulates in the loop.
+    # Torque noise shows above that of the positions in a few slow lines; differences of samples show what circulates in
+    # the loop.
     assert setup.problem.tau_std == pytest.approx(whole.problem.tau_std, rel=0.25)
     assert np.max(set_up(single).problem.tau_std / whole.problem.tau_std) > 10.0
     assert np.all(np.abs(baseline.costs / baseline.counts - 1.0) < 0.2)
@@ -155,7 +166,9 @@ def test_noise_that_all_records_tell_weighs_each_of_them(single):
     samples = setup.problem.samples(group)
     noise = {"tau_std": setup.problem.tau_std, "q_std": setup.problem.q_std, "samples": samples}
     silent = replace(group, U_noise=0.0 * group.U_noise, Q_noise=0.0 * group.Q_noise)
-    told, alone = (residual_covariance(g, Z, **noise)[0, 0, 0].real for g in (silent, replace(silent, known_noise=None)))
+    told, alone = (
+        residual_covariance(g, Z, **noise)[0, 0, 0].real for g in (silent, replace(silent, known_noise=None))
+    )
     level = setup.problem.tau_std[0] ** 2 / samples
     assert told > 0.2 * level > 20.0 * alone
 

@@ -34,11 +34,27 @@ def written(folder, old="", new="", lock=None):
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [
-        ('"0 1 0"', '"0 1e-300 0"', "axis of joint shoulder: .*arm.urdf: found a vector of 1e-300, expected a direction"),
+        (
+            '"0 1 0"',
+            '"0 1e-300 0"',
+            "axis of joint shoulder: .*arm.urdf: found a vector of 1e-300, expected a direction",
+        ),
         ('"0 1 0"', '"0 1e-160 0"', "axis of joint shoulder"),
-        (UPPER, '<mass value="9e14"/><inertia ixx="9e14" iyy="9e14" izz="9e14"/>', "joint shoulder: .*arm.urdf: found .* carried, which gives .* = "),
-        ("</joint></robot>", '<mimic joint="shoulder" multiplier="nan"/></joint></robot>', "multiplier of the mimic of joint wrist: .*'nan'"),
-        ("</joint></robot>", '<mimic joint="shoulder" offset="left"/></joint></robot>', "offset of the mimic of joint wrist: .*'left'"),
+        (
+            UPPER,
+            '<mass value="9e14"/><inertia ixx="9e14" iyy="9e14" izz="9e14"/>',
+            "joint shoulder: .*arm.urdf: found .* carried, which gives .* = ",
+        ),
+        (
+            "</joint></robot>",
+            '<mimic joint="shoulder" multiplier="nan"/></joint></robot>',
+            "multiplier of the mimic of joint wrist: .*'nan'",
+        ),
+        (
+            "</joint></robot>",
+            '<mimic joint="shoulder" offset="left"/></joint></robot>',
+            "offset of the mimic of joint wrist: .*'left'",
+        ),
     ],
 )
 def test_what_no_robot_can_be_made_of_names_the_urdf_and_the_joint(tmp_path, old, new, found):
@@ -50,10 +66,18 @@ def test_what_no_robot_can_be_made_of_names_the_urdf_and_the_joint(tmp_path, old
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        (UPPER, '<mass value="3"/><inertia ixx="10000" iyy="30000" izz="30000"/>', "the inertia of link upper is 3e+04 kg m2 at 3 kg, as of a body of 100 m: in kg mm2 or g mm2?"),
+        (
+            UPPER,
+            '<mass value="3"/><inertia ixx="10000" iyy="30000" izz="30000"/>',
+            "the inertia of link upper is 3e+04 kg m2 at 3 kg, as of a body of 100 m: in kg mm2 or g mm2?",
+        ),
         ('"0.2 0 0"', '"200 0 0"', "the centre of mass of link upper is 200 m off: in mm?"),
         ('"0.4 0 0"', '"400 0 0"', "joint wrist is 400 m off its link: in mm?"),
-        ('lower="-1" upper="1"', 'lower="-170" upper="170"', "the limits of joint wrist are -170 to 170 rad: in degrees?"),
+        (
+            'lower="-1" upper="1"',
+            'lower="-170" upper="170"',
+            "the limits of joint wrist are -170 to 170 rad: in degrees?",
+        ),
         ('lower="-1" upper="1"', "", "joint wrist has no limits in the URDF: a turn is taken"),
         ('effort="20"', 'effort="many"', "effort of joint wrist is 'many', which is no limit: one is guessed"),
         ('velocity="3"', 'velocity="-3"', "velocity of joint shoulder is '-3', which is no limit: one is guessed"),
@@ -69,7 +93,9 @@ def test_what_is_hardly_so_is_told(tmp_path, old, new, told):
 @pytest.mark.parametrize(("at", "refused"), [(0.5, False), (1.0, False), (1.2, True), (-9.0, True)])
 def test_a_joint_is_locked_within_its_limits(tmp_path, at, refused):
     if refused:
-        with pytest.raises(DataError, match=f"--lock: .*arm.urdf: found wrist={at:g}, expected a position within its limits, -1 to 1"):
+        with pytest.raises(
+            DataError, match=f"--lock: .*arm.urdf: found wrist={at:g}, expected a position within its limits, -1 to 1"
+        ):
             written(tmp_path, lock={"wrist": at})
     else:
         assert written(tmp_path, lock={"wrist": at})[0].locked == {"wrist": at}
@@ -78,7 +104,11 @@ def test_a_joint_is_locked_within_its_limits(tmp_path, at, refused):
 def test_the_command_prints_what_is_hardly_so(tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM.replace('"0.2 0 0"', '"200 0 0"'))
     result = run("robot", tmp_path / "arm.urdf", "--out", tmp_path / "out")
-    assert result.returncode == 0 and "warning: the centre of mass of link upper is 200 m off" in result.stdout and not result.stderr
+    assert (
+        result.returncode == 0
+        and "warning: the centre of mass of link upper is 200 m off" in result.stdout
+        and not result.stderr
+    )
     assert load_robot(tmp_path / "out").n == 2
 
 

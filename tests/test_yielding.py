@@ -53,7 +53,8 @@ def test_the_step_is_of_second_order(exponent, recoil):
 
 
 def test_a_bristle_is_exact_over_steps_of_constant_velocity():
-    """Dahl's closed form ``z = 1 - (1 + end) exp(-s)`` along a flank of a saw tooth (Dahl 1968), however long the steps."""
+    """Dahl's closed form ``z = 1 - (1 + end) exp(-s)`` along a flank of a saw tooth (Dahl 1968), however long the
+    steps."""
     length, speed, flank = 1e-3, 0.05, 5e-3
     for points in (8, 400):
         dt = flank / speed / points
@@ -85,7 +86,12 @@ def test_a_step_stays_within_the_limit_and_never_turns_against_its_path(exponent
 
 
 @given(
-    st.floats(0.5, 60.0), st.floats(0.0, 1.5), st.floats(-1.0, 1.0), st.floats(-3.0, 3.0), st.floats(0.0, 0.5), st.floats(-2.0, 2.0)
+    st.floats(0.5, 60.0),
+    st.floats(0.0, 1.5),
+    st.floats(-1.0, 1.0),
+    st.floats(-3.0, 3.0),
+    st.floats(0.0, 0.5),
+    st.floats(-2.0, 2.0),
 )
 @settings(max_examples=500, deadline=None)
 def test_the_step_of_a_loop_solves_its_equation(exponent, recoil, start, free, give, near):
@@ -119,7 +125,10 @@ def test_presliding_friction_is_the_lugre_law():
     found = scipy.integrate.solve_ivp(rate, (0.0, 2.0), [0.0], t_eval=1.0 + t, rtol=1e-10, atol=1e-13)
     expected = stiffness * (found.y[0] + relaxation * rate(t, found.y[0]))
     (law,) = presliding_friction(0, "axis").law(
-        np.array([stiffness, coulomb, 1.0, relaxation]), SimpleNamespace(v=lambda j: velocity(t)[None], time_step=1.0 / T, group=SimpleNamespace(window=None)), 0, 1e4
+        np.array([stiffness, coulomb, 1.0, relaxation]),
+        SimpleNamespace(v=lambda j: velocity(t)[None], time_step=1.0 / T, group=SimpleNamespace(window=None)),
+        0,
+        1e4,
     )
     assert law == pytest.approx(expected, abs=2e-3 * coulomb)
     assert np.abs(law - stiffness * found.y[0]).max() > 0.2 * coulomb

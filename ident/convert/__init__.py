@@ -49,7 +49,9 @@ def convert_logs(
         short = [s for s in found if s.n_samples < SHORTEST]
         if short:
             path = next(iter(paths.values()))
-            raise DataError("samples", str(path), f"{short[0].n_samples} of {short[0].name}", f"at least {SHORTEST} a segment")
+            raise DataError(
+                "samples", str(path), f"{short[0].n_samples} of {short[0].name}", f"at least {SHORTEST} a segment"
+            )
         segments += found
     if len({s.name for s in segments}) < len(segments):
         raise DataError("files", str(map_path), "two logs of one name", "distinct names")
@@ -81,7 +83,9 @@ def _logs(files: list[Path], m: LogMap, where: str) -> list[tuple[str, dict[str,
             raise DataError("[files]", where, f"{len(fits)} entries for {path.name}", "one entry for each file given")
         log = folders.setdefault(path.parent, {})
         if fits[0] in log:
-            raise DataError("[files]", where, f"{path.name} and {log[fits[0]].name} for {fits[0]}", "one file of a kind a folder")
+            raise DataError(
+                "[files]", where, f"{path.name} and {log[fits[0]].name} for {fits[0]}", "one file of a kind a folder"
+            )
         log[fits[0]] = path
     for folder, log in folders.items():
         missing = [f.pattern for f in m.files if f.prefix not in log]
@@ -121,12 +125,19 @@ def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
         for key, x in (read_log(paths[part.prefix], wanted, times) if wanted else {}).items():
             if part.width is not None and key != part.time:
                 if x.size % part.width:
-                    raise DataError(key, str(paths[part.prefix]), f"{x.size} values", f"a multiple of width = {part.width}")
+                    raise DataError(
+                        key, str(paths[part.prefix]), f"{x.size} values", f"a multiple of width = {part.width}"
+                    )
                 x = x.reshape(-1, part.width)
             data[start + key] = x
     lost = sorted(m.sources - set(data))
     if lost:
-        raise DataError("source", str(next(iter(paths.values()))), lost[0], f"a name that starts with one of {[f.prefix + ':' for f in m.files]}")
+        raise DataError(
+            "source",
+            str(next(iter(paths.values()))),
+            lost[0],
+            f"a name that starts with one of {[f.prefix + ':' for f in m.files]}",
+        )
     return data
 
 
@@ -156,15 +167,24 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
             rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)
             say(f"{path.name}: {changed(clock, rows, len(t), m.sample_rate)}")
             channels = {k: resample(v, clock, t, m.sample_rate) for k, v in channels.items()}
-    return [replace(s, filled=_filled(clocks, start + s.t[0], start + s.t[-1])) for s in _cut(name, path, m, t, channels, data)]
+    return [
+        replace(s, filled=_filled(clocks, start + s.t[0], start + s.t[-1]))
+        for s in _cut(name, path, m, t, channels, data)
+    ]
 
 
 def _filled(clocks: list[Stamps], start: float, end: float) -> Filled | None:
     found = [f for clock in clocks if (f := clock.filled(start, end)) is not None]
-    return Filled(sum(f.gaps for f in found), max(f.longest for f in found), sum(f.total for f in found)) if found else None
+    return (
+        Filled(sum(f.gaps for f in found), max(f.longest for f in found), sum(f.total for f in found))
+        if found
+        else None
+    )
 
 
-def _cut(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray], data: dict[str, np.ndarray]) -> list[Segment]:
+def _cut(
+    name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray], data: dict[str, np.ndarray]
+) -> list[Segment]:
     """Segments of one log: parts of a multisine, or a motion."""
     N = len(t)
     if m.period is None:
@@ -177,7 +197,12 @@ def _cut(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np
     out = []
     for i, part in enumerate(m.parts):
         if part.last * m.period > N:
-            raise DataError("multisine.part", str(path), f"periods {part.first} to {part.last}", f"within the {N // m.period} of the log")
+            raise DataError(
+                "multisine.part",
+                str(path),
+                f"periods {part.first} to {part.last}",
+                f"within the {N // m.period} of the log",
+            )
         pick = slice((part.first - 1) * m.period, part.last * m.period)
         out.append(
             Segment(
@@ -233,7 +258,8 @@ def _channels(data: dict[str, np.ndarray], m: LogMap, n: int, path: Path) -> dic
 
 
 def _check_values(x: np.ndarray, c: Column, path: Path) -> None:
-    """Raise a DataError where a column (N,) of the dataset has a value that it cannot hold; a link encoder may have none."""
+    """Raise a DataError where a column (N,) of the dataset has a value that it cannot hold; a link encoder may have
+    none."""
     bad = np.flatnonzero(~np.isfinite(x) & ~(np.isnan(x) & (c.channel == "q_link")))
     name = f"{c.channel}_{c.joint + 1}"
     if len(bad):
@@ -242,11 +268,14 @@ def _check_values(x: np.ndarray, c: Column, path: Path) -> None:
         raise DataError(name, str(path), found, "finite numbers")
     large = np.flatnonzero(np.abs(x) > LARGEST)
     if len(large):
-        raise DataError(name, str(path), f"{x[large[0]]:.3g} of {c.source} at sample {large[0]}", f"at most {LARGEST:g} in SI units")
+        raise DataError(
+            name, str(path), f"{x[large[0]]:.3g} of {c.source} at sample {large[0]}", f"at most {LARGEST:g} in SI units"
+        )
 
 
 def _signal(x: np.ndarray, name: str, index: int | None, joint: int, path: Path) -> np.ndarray:
-    """One signal (N,) of a source; of two dimensions the longer is time. Without an index it is the column of the joint."""
+    """One signal (N,) of a source; of two dimensions the longer is time. Without an index it is the column of the
+    joint."""
     if x.ndim > 2:
         raise DataError(name, str(path), f"{x.ndim} dimensions, {' x '.join(map(str, x.shape))}", "one or two")
     if x.ndim < 2 or min(x.shape) == 1:

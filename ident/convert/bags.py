@@ -58,7 +58,8 @@ def _mcap_messages(path: Path, file: Any) -> Iterator[tuple[str, int, Any]]:
     for schema, channel, message in make_reader(file).iter_messages():
         if schema is None or schema.name not in TYPES:
             continue
-        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # the parser of definitions prints its errors
+        # the parser of definitions prints its errors
+        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):
             decode = factory.decoder_for(channel.message_encoding, schema)
         if decode is None:
             found = f"{channel.message_encoding} with a {schema.encoding} schema"
@@ -76,7 +77,13 @@ def _db3_messages(path: Path) -> Iterator[tuple[str, int, Any]]:
             kind = bag.execute("SELECT type FROM sqlite_master WHERE name = ?", (name,)).fetchone()
             computed = [c[1] for c in bag.execute(f"PRAGMA table_xinfo({name})") if c[6]]
             if kind != ("table",) or computed:
-                found = "no such table" if kind is None else f"computed column {computed[0]}" if computed else f"a {kind[0]}"
+                found = (
+                    "no such table"
+                    if kind is None
+                    else f"computed column {computed[0]}"
+                    if computed
+                    else f"a {kind[0]}"
+                )
                 raise DataError(name, str(path), found, "a table of rosbag2")
         topics = {
             key: name
@@ -137,5 +144,7 @@ def _topic(rows: list[tuple[int, Any]], wanted: set[str] | None) -> dict[str, np
         full = all(len(getattr(m, field)) == len(m.name) for _, m in rows)
         for joint in sorted(asked) if full else []:
             if all(joint in m.name for _, m in rows):
-                out[f"{field}.{joint}"] = np.array([getattr(m, field)[list(m.name).index(joint)] for _, m in rows], float)
+                out[f"{field}.{joint}"] = np.array(
+                    [getattr(m, field)[list(m.name).index(joint)] for _, m in rows], float
+                )
     return out

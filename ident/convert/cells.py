@@ -78,10 +78,19 @@ class Cells:
             except pa.ArrowInvalid:
                 pass
         # A comma is the decimal sign where no point is; in quotes it may also part thousands.
-        if self.dot or pc.any(pc.match_substring(column, ".")).as_py() or pc.any(pc.match_substring_regex(column, SEVERAL_COMMAS)).as_py():
+        if (
+            self.dot
+            or pc.any(pc.match_substring(column, ".")).as_py()
+            or pc.any(pc.match_substring_regex(column, SEVERAL_COMMAS)).as_py()
+        ):
             raise ValueError("both signs")
         commas = column.filter(pc.match_substring(column, ",").fill_null(False))
-        if self.quoted and not self.comma and len(commas) and pc.all(pc.match_substring_regex(commas, THOUSANDS)).as_py():
+        if (
+            self.quoted
+            and not self.comma
+            and len(commas)
+            and pc.all(pc.match_substring_regex(commas, THOUSANDS)).as_py()
+        ):
             raise ValueError("thousands")
         out = _cast(pc.replace_substring(column, ",", "."))
         self.comma = True
@@ -91,11 +100,15 @@ class Cells:
         """Of cells that are not all like those above: an error, or texts; a few among numbers are none, and told."""
         if self.kind == "dates":
             cells = [_text(x).strip() for x in column]
-            bad = np.array([c != "" and (not is_date(c) or bool(DATE.match(c)) != bool(DATE.match(self.like))) for c in cells])
+            bad = np.array(
+                [c != "" and (not is_date(c) or bool(DATE.match(c)) != bool(DATE.match(self.like))) for c in cells]
+            )
             if not np.any(bad):
                 bad[self._no_date(column)] = True
         else:
-            plain = pc.replace_substring(column, ",", ".") if self.comma or (not self.dot and not self.quoted) else column
+            plain = (
+                pc.replace_substring(column, ",", ".") if self.comma or (not self.dot and not self.quoted) else column
+            )
             bad = ~pc.match_substring_regex(plain, NUMBER).fill_null(True).to_numpy(zero_copy_only=False)
         index = int(np.argmax(bad))
         row, text = self.rows + index + 1, _text(column[index]).strip()
@@ -109,12 +122,19 @@ class Cells:
         if not self.wanted:
             return
         if kind == "dates":
-            raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "dates that exist, all written in one way")
+            raise DataError(
+                "signal",
+                str(self.path),
+                f"{self.name} = {text[:60]!r} in row {row}",
+                "dates that exist, all written in one way",
+            )
         if first:
             what = "true and false" if text.lower() in ("true", "false") else f"texts: {text[:60]!r} in row {row}"
             raise DataError("signal", str(self.path), f"{self.name} is no array of numbers but of {what}", "numbers")
         if text == self.name:
-            raise DataError("signal", str(self.path), f"the header again in row {row}", "one log: cut the file in two there")
+            raise DataError(
+                "signal", str(self.path), f"the header again in row {row}", "one log: cut the file in two there"
+            )
         raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "numbers")
 
     def _no_date(self, column: pa.Array) -> int:

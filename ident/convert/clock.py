@@ -70,7 +70,9 @@ def check_stamps(t: np.ndarray, rate: float, path: Path) -> Stamps:
     step = np.diff(t)
     bad = np.flatnonzero(~np.isfinite(t))
     if len(bad):
-        raise DataError("time", str(path), f"no stamp at sample {bad[0]} ({len(bad)} not finite in all)", "a stamp for each sample")
+        raise DataError(
+            "time", str(path), f"no stamp at sample {bad[0]} ({len(bad)} not finite in all)", "a stamp for each sample"
+        )
     back = np.flatnonzero(step < 0)
     if len(back):
         k, more = int(back[0]), f", {len(back)} times in all" if len(back) > 1 else ""
@@ -95,7 +97,9 @@ def uniform_times(start: float, end: float, rate: float) -> np.ndarray:
 
 def at_times(stamps: Stamps, t: np.ndarray, rate: float) -> bool:
     """Whether the samples stand at times ``t``, or at even steps beside them, as they are."""
-    return len(t) == len(stamps.t) and bool(np.all(np.abs(np.diff(stamps.t) * rate - 1) < JITTER) and abs(stamps.t[0] - t[0]) * rate < JITTER)
+    return len(t) == len(stamps.t) and bool(
+        np.all(np.abs(np.diff(stamps.t) * rate - 1) < JITTER) and abs(stamps.t[0] - t[0]) * rate < JITTER
+    )
 
 
 def folds(stamps: Stamps, rate: float) -> bool:
@@ -115,12 +119,17 @@ def resample(x: np.ndarray, stamps: Stamps, t: np.ndarray, rate: float) -> np.nd
         return np.stack([np.interp(t, at, c) for c in x.T], axis=1)
     factor = int(np.ceil(stamps.rate / rate))
     fine = t[0] + np.arange((len(t) - 1) * factor + 1) / (factor * rate)
-    return np.stack([_decimate(_between(fine, at, c), factor) if np.all(np.isfinite(c)) else np.interp(t, at, c) for c in x.T], axis=1)
+    return np.stack(
+        [_decimate(_between(fine, at, c), factor) if np.all(np.isfinite(c)) else np.interp(t, at, c) for c in x.T],
+        axis=1,
+    )
 
 
 def _between(t: np.ndarray, at: np.ndarray, x: np.ndarray) -> np.ndarray:
     """(len(t),) values between samples; monotone, as stamps that jitter would make a smooth curve swing."""
-    return scipy.interpolate.PchipInterpolator(at, x)(np.clip(t, at[0], at[-1])) if len(at) > 1 else np.full(len(t), x[0])
+    return (
+        scipy.interpolate.PchipInterpolator(at, x)(np.clip(t, at[0], at[-1])) if len(at) > 1 else np.full(len(t), x[0])
+    )
 
 
 def _decimate(x: np.ndarray, factor: int) -> np.ndarray:

@@ -11,7 +11,9 @@ import pyarrow.compute as pc
 
 CLOCK = r"\d\d?:\d\d(:\d\d([.,]\d{1,9})?)?( ?[AaPp][Mm])?"
 ZONE = r"(Z|[+-]\d\d:?\d\d)$"
-DATE = re.compile(rf"(?P<a>\d{{1,4}})(?P<sign>[-./])(?P<b>\d\d?)(?P=sign)(?P<c>\d{{1,4}})([T ] ?{CLOCK}(Z|[+-]\d\d:?\d\d)?)?$")
+DATE = re.compile(
+    rf"(?P<a>\d{{1,4}})(?P<sign>[-./])(?P<b>\d\d?)(?P=sign)(?P<c>\d{{1,4}})([T ] ?{CLOCK}(Z|[+-]\d\d:?\d\d)?)?$"
+)
 TIME = re.compile(rf"{CLOCK}$")
 DAY = 86400.0  # s
 
@@ -30,7 +32,9 @@ def as_dates(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
             return np.concatenate([as_dates(chunk) for chunk in column.chunks]) if column.num_chunks else np.zeros(0)
     if pa.types.is_time(column.type):
         counts = column.cast(pa.int32() if column.type.bit_width == 32 else pa.int64())
-        out = counts.fill_null(0).to_numpy(zero_copy_only=False).astype("int64").view(f"timedelta64[{column.type.unit}]")
+        out = (
+            counts.fill_null(0).to_numpy(zero_copy_only=False).astype("int64").view(f"timedelta64[{column.type.unit}]")
+        )
         out = np.where(column.is_null().to_numpy(zero_copy_only=False), np.timedelta64("NaT"), out)
         return out
     if pa.types.is_decimal(column.type):
@@ -41,7 +45,8 @@ def as_dates(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
 
 
 def dates_of_texts(texts: Any) -> np.ndarray:
-    """(N,) datetime64 of texts such as "2026-01-31T10:00:00.125Z" or "31.01.2026 10:00:00,125", timedelta64 of times of the
+    """(N,) datetime64 of texts such as "2026-01-31T10:00:00.125Z" or "31.01.2026 10:00:00,125", timedelta64 of times of
+    the
     day; the texts themselves where they are none.
     """
     column = texts if isinstance(texts, pa.Array) else pa.array(texts)
@@ -55,7 +60,8 @@ def dates_of_texts(texts: Any) -> np.ndarray:
 
 
 def date_order(column: pa.Array) -> tuple[str, bool]:
-    """The order of year, month and day in texts of dates, and whether it is a guess: "3/4/2026" may be of April or of March."""
+    """The order of year, month and day in texts of dates, and whether it is a guess: "3/4/2026" may be of April or of
+    March."""
     first = next((x.as_py() for x in column if x.is_valid and x.as_py()), "").strip()
     found = DATE.match(first)
     if found is None or len(found["a"]) == 4:
@@ -88,7 +94,9 @@ def parse_dates(column: pa.Array, like: str, order: tuple[str, bool]) -> np.ndar
     elif order[0] == "ymd":
         texts = pc.replace_substring_regex(texts, r"^(\d{4})[-./](\d\d?)[-./](\d\d?)", r"\1-\2-\3")
     else:
-        texts = pc.replace_substring_regex(texts, r"^(\d\d?)[-./](\d\d?)[-./](\d{4})", r"\3-\2-\1" if order[0] == "dmy" else r"\3-\1-\2")
+        texts = pc.replace_substring_regex(
+            texts, r"^(\d\d?)[-./](\d\d?)[-./](\d{4})", r"\3-\2-\1" if order[0] == "dmy" else r"\3-\1-\2"
+        )
     for one_digit in (r"^(\d{4}-)(\d)-", r"^(\d{4}-\d\d-)(\d)([T ]|$)", r"^(\d{4}-\d\d-\d\d[T ])\s*(\d):"):
         tail = {"-": "-", ")": r"\3", ":": ":"}[one_digit[-1]]
         texts = pc.replace_substring_regex(texts, one_digit, r"\10\2" + tail)

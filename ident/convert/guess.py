@@ -43,7 +43,9 @@ class GuessedMap:
     warnings: tuple[str, ...] = ()
 
 
-def guess_map(files: Sequence[Path], robot: str | Path, *, progress: Callable[[str], None] = lambda text: None) -> GuessedMap:
+def guess_map(
+    files: Sequence[Path], robot: str | Path, *, progress: Callable[[str], None] = lambda text: None
+) -> GuessedMap:
     """Guess the map of one or more logs of a robot.
 
     Args:
@@ -65,9 +67,19 @@ def guess_map(files: Sequence[Path], robot: str | Path, *, progress: Callable[[s
     logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in s.signals.items()} for s in surveys]
     parts = _parts(paths, logs, arm)
     starts = [f"{prefix}:" for prefix in parts] or [""]
-    units = {f"{p}{k}": u for p, s in zip(starts, surveys) for k, text in s.units.items() if (u := unit_of(text.strip("[](){}<> ")))}
+    units = {
+        f"{p}{k}": u
+        for p, s in zip(starts, surveys)
+        for k, text in s.units.items()
+        if (u := unit_of(text.strip("[](){}<> ")))
+    }
     dates = {f"{p}{k}" for p, s in zip(starts, surveys) for k in s.dates}
-    damaged = {f"{p}{k}": int(bad[0]) + 1 for p, s in zip(starts, surveys) for k, x in s.signals.items() if len(bad := np.flatnonzero(~np.isfinite(x)))}
+    damaged = {
+        f"{p}{k}": int(bad[0]) + 1
+        for p, s in zip(starts, surveys)
+        for k, x in s.signals.items()
+        if len(bad := np.flatnonzero(~np.isfinite(x)))
+    }
     doubts = {f"{p}{k}": text for p, s in zip(starts, surveys) for k, text in s.doubts.items()}
     warnings = [f"{p.name}: guessed from its first {s.cut} rows" for p, s in zip(paths, surveys) if s.cut]
     clocks = _clocks(logs, starts, units, dates, damaged, arm, warnings) if parts else {}
@@ -79,20 +91,36 @@ def guess_map(files: Sequence[Path], robot: str | Path, *, progress: Callable[[s
     # The log has the length at which most values stand.
     N = max(set(lengths), key=lambda k: sum(x.size for x in signals.values() if _length(x) == k))
     families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm)
-    time = FoundTime(rate=min(c.rate for c in clocks.values())) if clocks else find_time(families, signals, dates, damaged, doubts)
+    time = (
+        FoundTime(rate=min(c.rate for c in clocks.values()))
+        if clocks
+        else find_time(families, signals, dates, damaged, doubts)
+    )
     chosen, others = choose([f for f in families if f.x.shape[1] == arm.n and f.name not in time.sources | dates], arm)
     if not {"tau", "q"} & set(chosen):
         names = ", ".join(plain(f.name) for f in families if f.name not in time.sources)
-        raise DataError("signals", str(paths[0]), f"nothing that looks like a position or a torque of {arm.n} joints: {names[:300] or 'none'}", "names or units that tell, or a map by hand")
+        raise DataError(
+            "signals",
+            str(paths[0]),
+            f"nothing that looks like a position or a torque of {arm.n} joints: {names[:300] or 'none'}",
+            "names or units that tell, or a map by hand",
+        )
     linear = linear_joints(arm)
     chosen = {c: unwrapped(f) if c in ("q", "q_ref", "q_link") and not np.any(linear) else f for c, f in chosen.items()}
     scales = guess_scales(chosen, arm, linear, time.rate)
     text = render(paths, arm, parts, clocks, time, chosen, others, scales, families, linear, doubts)
     found = {c: f"{chosen[c].name}{', ' + ', '.join(s.options) if (s := scales[c]).options else ''}" for c in chosen}
     if time.source is not None or clocks:
-        found["time"] = f"{', '.join(c.name for c in clocks.values()) if clocks else ' + '.join((time.source or '', *(p[0] for p in time.plus)))}, {time.rate:g} Hz"
+        found["time"] = (
+            f"{', '.join(c.name for c in clocks.values()) if clocks else ' + '.join((time.source or '', *(p[0] for p in time.plus)))}, {time.rate:g} Hz"
+        )
         found["time"] += f"; {time.doubt}" if time.doubt else ""
-    warnings += [f"{name} {doubts[name]}: the conversion will name it" for f in chosen.values() for name, _ in f.sources if name in doubts]
+    warnings += [
+        f"{name} {doubts[name]}: the conversion will name it"
+        for f in chosen.values()
+        for name, _ in f.sources
+        if name in doubts
+    ]
     if time.lost is not None:
         warnings.insert(0, f"no time: {time.lost[0]} {time.lost[2]}")
     return GuessedMap(text, found, tuple(c for c in ("tau", "q") if c not in chosen), tuple(warnings))
@@ -128,10 +156,13 @@ def _parts(paths: list[Path], logs: list[dict[str, np.ndarray]], arm: Robot) -> 
 
 
 def _a_joint_each(logs: list[dict[str, np.ndarray]], arm: Robot) -> bool:
-    """Whether files that have position and torque are of a joint each: as many as joints, alike, and none has columns of all."""
+    """Whether files that have position and torque are of a joint each: as many as joints, alike, and none has columns
+    of all."""
     if len(logs) != arm.n or arm.n == 1 or any(set(log) != set(logs[0]) for log in logs):
         return False
-    return all(f.x.shape[1] == 1 for f in families_of({k: x for k, x in logs[0].items() if _length(x) >= SHORTEST}, {}, arm))
+    return all(
+        f.x.shape[1] == 1 for f in families_of({k: x for k, x in logs[0].items() if _length(x) >= SHORTEST}, {}, arm)
+    )
 
 
 def _clocks(
@@ -143,11 +174,15 @@ def _clocks(
     arm: Robot,
     warnings: list[str],
 ) -> dict[str, FileClock]:
-    """Prefix -> clock where each file has one of its own; else empty, and ``warnings`` say of one that cannot be used."""
+    """Prefix -> clock where each file has one of its own; else empty, and ``warnings`` say of one that cannot be
+    used."""
     out = {}
     for log, start in zip(logs, starts, strict=True):
         own = {k: units[f"{start}{k}"] for k in log if f"{start}{k}" in units}
-        own_dates, bad = {d.removeprefix(start) for d in dates if d.startswith(start)}, {k: damaged[f"{start}{k}"] for k in log if f"{start}{k}" in damaged}
+        own_dates, bad = (
+            {d.removeprefix(start) for d in dates if d.startswith(start)},
+            {k: damaged[f"{start}{k}"] for k in log if f"{start}{k}" in damaged},
+        )
         time = find_time(families_of(log, own, arm), log, own_dates, bad, {})
         if time.source is None or time.t is None or time.rate is None or time.plus:
             if time.lost is not None:
@@ -165,7 +200,9 @@ def _on_one_clock(logs: list[dict[str, np.ndarray]], clocks: dict[str, FileClock
     for log, (start, c) in zip(logs, clocks.items(), strict=True):
         for name, x in log.items():
             if name != c.name and _length(x) == len(c.t):
-                out[f"{start}{name}"] = np.stack([np.interp(t, c.t - c.t[0], column) for column in oriented(x).T], axis=1)
+                out[f"{start}{name}"] = np.stack(
+                    [np.interp(t, c.t - c.t[0], column) for column in oriented(x).T], axis=1
+                )
     return out
 
 

@@ -26,7 +26,23 @@ REFERENCE = ("ref", "cmd", "des", "desired", "command", "target", "setpoint", "g
 LINK = ("link", "load", "se", "secondary", "output", "arm", "abtrieb", "ql", "external")
 MOTOR = ("motor", "mot", "qm")
 ACTUAL = ("act", "actual", "meas", "measured", "ist", "rec", "state", "states", "read")
-DERIVED = ("err", "error", "ff", "feedforward", "acc", "acceleration", "ddq", "qdd", "model", "est", "sim", "init", "limit", "residual", "std")
+DERIVED = (
+    "err",
+    "error",
+    "ff",
+    "feedforward",
+    "acc",
+    "acceleration",
+    "ddq",
+    "qdd",
+    "model",
+    "est",
+    "sim",
+    "init",
+    "limit",
+    "residual",
+    "std",
+)
 # What a unit says; a length may as well be of a tool as of a linear drive, and needs a name beside it.
 QUANTITIES = (
     dict.fromkeys(("N m", "mN m", "kN m", "N", "kN", "A", "mA", "V"), "torque")
@@ -37,7 +53,13 @@ QUANTITIES = (
 LENGTHS = ("m", "mm", "um")
 PREFIXED = ("mNm", "kNm", "mN", "kN", "mA")  # units that a capital does not part
 # Names of KUKA's Robot Sensor Interface.
-CALLED = {"aipos": ("act", "pos"), "aspos": ("soll", "pos"), "eipos": ("external", "pos"), "macur": ("act", "cur"), "mecur": ("external", "cur")}
+CALLED = {
+    "aipos": ("act", "pos"),
+    "aspos": ("soll", "pos"),
+    "eipos": ("external", "pos"),
+    "macur": ("act", "cur"),
+    "mecur": ("external", "cur"),
+}
 TOLD = 3.0  # as surely as a name at its best
 
 
@@ -152,7 +174,13 @@ def _alike(names: list[str], stems: dict[str, str], units: dict[str, str], n: in
 
 def _fit(words: tuple[str, ...], unit: str | None) -> dict[str, float]:
     """Quantity -> how surely words and unit tell of it."""
-    fit = {k: max((v for w in words for word, v in table.items() if w == word or (len(word) > 3 and w.startswith(word))), default=0.0) for k, table in WORDS.items()}
+    fit = {
+        k: max(
+            (v for w in words for word, v in table.items() if w == word or (len(word) > 3 and w.startswith(word))),
+            default=0.0,
+        )
+        for k, table in WORDS.items()
+    }
     kind = QUANTITIES.get(unit or "")
     if kind is not None and (fit[kind] > 0 or unit not in LENGTHS):
         fit[kind] += TOLD
@@ -184,7 +212,10 @@ def choose(families: list[Family], arm: Robot) -> tuple[dict[str, Family], dict[
     others: dict[str, list[Family]] = {}
     taken: set[str] = set()
     for channel in CHANNELS:
-        ranked = sorted((f for f in moving if f.name not in taken and score(f.words, channel, f.unit) > 0), key=lambda f: -score(f.words, channel, f.unit))
+        ranked = sorted(
+            (f for f in moving if f.name not in taken and score(f.words, channel, f.unit) > 0),
+            key=lambda f: -score(f.words, channel, f.unit),
+        )
         if ranked:
             chosen[channel] = ranked[0]
             others[channel] = ranked[1:5]

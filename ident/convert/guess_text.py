@@ -14,7 +14,18 @@ from ident.convert.guess_units import Family, Scale, range_text
 from robot_assets.robot import Robot
 
 # Of a linear joint, where the others of the arm turn and say their units in angles.
-LINEAR_UNITS = {"rad": "m", "mrad": "mm", "deg": "mm", "rev": "m", "rad/s": "m/s", "deg/s": "mm/s", "rpm": "mm/s", "N m": "N", "mN m": "N", "kN m": "kN"}
+LINEAR_UNITS = {
+    "rad": "m",
+    "mrad": "mm",
+    "deg": "mm",
+    "rev": "m",
+    "rad/s": "m/s",
+    "deg/s": "mm/s",
+    "rpm": "mm/s",
+    "N m": "N",
+    "mN m": "N",
+    "kN m": "kN",
+}
 
 
 def render(
@@ -40,7 +51,11 @@ def render(
     if len(paths) == 1 or parts:
         lines.append("split = 0.7              # the first 70 % identify, the rest validates")
     elif len(paths) > 1:
-        lines += ["", "[roles]", *(f'{quoted(p.name)} = "{"validation" if p is paths[-1] else "identification"}"' for p in paths)]
+        lines += [
+            "",
+            "[roles]",
+            *(f'{quoted(p.name)} = "{"validation" if p is paths[-1] else "identification"}"' for p in paths),
+        ]
     if parts:
         lines += ["", "[files]                  # one log over several files; their signals are prefix:name"]
         for prefix, (path, width) in parts.items():
@@ -52,13 +67,25 @@ def render(
         if clocks:
             lines.append("# Each has a time of its own: they are joined where all of them have samples.")
     if time.source is not None:
-        lines += ["", "[time]" + (f"                   # {plain(time.doubt)}" if time.doubt else ""), f"source = {quoted(time.source)}"]
+        lines += [
+            "",
+            "[time]" + (f"                   # {plain(time.doubt)}" if time.doubt else ""),
+            f"source = {quoted(time.source)}",
+        ]
         lines += [f'unit = "{time.unit}"'] if time.unit else ["# dates, which need no unit"]
         if time.plus:
-            lines.append("plus = [" + ", ".join(f'{{ source = {quoted(s)}, unit = "{u}" }}' for s, u in time.plus) + "]")
+            lines.append(
+                "plus = [" + ", ".join(f'{{ source = {quoted(s)}, unit = "{u}" }}' for s, u in time.plus) + "]"
+            )
     elif time.lost is not None:
         name, unit, why = time.lost
-        lines += ["", f"# EDIT: {plain(name)} is not used as the time: it {why}.", "# Mend the log, or leave it out: the samples then count as even.", "# [time]", f"# source = {quoted(name)}"]
+        lines += [
+            "",
+            f"# EDIT: {plain(name)} is not used as the time: it {why}.",
+            "# Mend the log, or leave it out: the samples then count as even.",
+            "# [time]",
+            f"# source = {quoted(name)}",
+        ]
         lines += [f'# unit = "{unit}"'] if unit else []
     lines += ["", "[columns]"]
     for channel in CHANNELS:
@@ -67,10 +94,16 @@ def render(
                 meaning = "motor torque or current" if channel == "tau" else "motor position"
                 lines += ["", f"# EDIT: nothing in the log looks like the {meaning}; complete and take the # away"]
                 unit = {"tau": ("N m", "N"), "q": ("rad", "m")}[channel]
-                lines += [f'# {channel}_{j + 1} = {{ source = "...", unit = "{unit[int(linear[j])]}" }}' for j in range(arm.n)]
+                lines += [
+                    f'# {channel}_{j + 1} = {{ source = "...", unit = "{unit[int(linear[j])]}" }}' for j in range(arm.n)
+                ]
             continue
         family, scale = chosen[channel], scales[channel]
-        damaged = (f"EDIT: {plain(name)} has {plain(doubts[name])}" for name, _ in dict(family.sources).items() if name in doubts)
+        damaged = (
+            f"EDIT: {plain(name)} has {plain(doubts[name])}"
+            for name, _ in dict(family.sources).items()
+            if name in doubts
+        )
         notes = "; ".join(note for note in (family.note, scale.note, *damaged) if note)
         lines += ["", f"# {channel}: {notes}" if notes else f"# {channel}"]
         if others[channel]:
@@ -79,8 +112,15 @@ def render(
         for j, (source, index) in enumerate(family.sources):
             options = [o for o in scale.options if channel != "tau" or o != "sign = -1" or scale.signs[j] < 0]
             if linear[j] and not np.all(linear):
-                options = [f'unit = "{LINEAR_UNITS[u]}"' if (u := o[len('unit = "') : -1]) in LINEAR_UNITS else o for o in options]
-            options = [f"source = {quoted(source)}", *([] if index is None or index == j else [f"index = {index}"]), *options]
+                options = [
+                    f'unit = "{LINEAR_UNITS[u]}"' if (u := o[len('unit = "') : -1]) in LINEAR_UNITS else o
+                    for o in options
+                ]
+            options = [
+                f"source = {quoted(source)}",
+                *([] if index is None or index == j else [f"index = {index}"]),
+                *options,
+            ]
             if channel != "temp" and np.ptp(family.x[:, j]) == 0 and channel not in ("tau", "q"):
                 lines.append(f"# {channel}_{j + 1} is constant in the log")
                 continue

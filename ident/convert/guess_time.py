@@ -34,7 +34,8 @@ class FoundTime:
         source: its column; None where there is none that can be used. unit: "" of dates.
         plus: (column, unit) of what is added: full seconds have their fraction beside them.
         t: (N,) in units of ``source``. rate: Hz; None where nothing says it.
-        doubt: what a person should look at, in words. lost: (column, unit, why) of one that looks like the time and cannot be.
+        doubt: what a person should look at, in words. lost: (column, unit, why) of one that looks like the time and
+            cannot be.
     """
 
     source: str | None = None
@@ -61,7 +62,13 @@ class FileClock:
     t: np.ndarray
 
 
-def find_time(families: list[Family], signals: dict[str, np.ndarray], dates: set[str], damaged: Mapping[str, int], doubts: Mapping[str, str]) -> FoundTime:
+def find_time(
+    families: list[Family],
+    signals: dict[str, np.ndarray],
+    dates: set[str],
+    damaged: Mapping[str, int],
+    doubts: Mapping[str, str],
+) -> FoundTime:
     """The time of a log.
 
     Args:
@@ -82,12 +89,20 @@ def find_time(families: list[Family], signals: dict[str, np.ndarray], dates: set
         if not np.any(step > 0):
             continue
         names = {f.name, *(p[0] for p in plus)}
-        trouble = next((f"has no number in row {damaged[n]}" for n in sorted(names) if n in damaged), "") or _goes_back(t, step)
+        trouble = next((f"has no number in row {damaged[n]}" for n in sorted(names) if n in damaged), "") or _goes_back(
+            t, step
+        )
         # One that mostly rises is the time all the same, and told to be damaged; others only have such a name.
         if trouble and np.mean(step > 0) < 0.9:
             continue
         median = float(np.median(step[step > 0]))
-        named = "s" if plus or date else f.unit if f.unit in SECONDS else next((NAMED_UNITS[w] for w in f.words if NAMED_UNITS.get(w) in SECONDS), None)
+        named = (
+            "s"
+            if plus or date
+            else f.unit
+            if f.unit in SECONDS
+            else next((NAMED_UNITS[w] for w in f.words if NAMED_UNITS.get(w) in SECONDS), None)
+        )
         unit, rate, doubt = _unit(median, named, t)
         # Whole numbers count samples more often than milliseconds.
         counter = bool(median == 1.0 and np.all(step == 1.0))
@@ -102,7 +117,10 @@ def find_time(families: list[Family], signals: dict[str, np.ndarray], dates: set
                 lost = key, FoundTime(rate=rounded, lost=(f.name, shown, trouble))
         elif best is None or key < best[0]:
             doubt = "; ".join(d for d in (doubt, *(f"EDIT? {doubts[n]}" for n in sorted(names) if n in doubts)) if d)
-            best = key, FoundTime(f.name, shown, plus, t, rounded, doubt.replace(" Hz if in", f" Hz if {f.name} is in", 1))
+            best = (
+                key,
+                FoundTime(f.name, shown, plus, t, rounded, doubt.replace(" Hz if in", f" Hz if {f.name} is in", 1)),
+            )
     if best is not None:
         return best[1]
     for name, x in signals.items():
@@ -131,14 +149,24 @@ def _unit(median: float, named: str | None, t: np.ndarray) -> tuple[str, float, 
     """Unit, rate in Hz and doubt of stamps of a median step."""
     if named:
         rate = 1.0 / (median * UNITS[named])
-        return named, rate, "" if RATES[0] <= rate <= RATES[1] else f"EDIT? {rate:.4g} Hz is {'slow' if rate < RATES[0] else 'fast'} for a log of an arm"
+        return (
+            named,
+            rate,
+            ""
+            if RATES[0] <= rate <= RATES[1]
+            else f"EDIT? {rate:.4g} Hz is {'slow' if rate < RATES[0] else 'fast'} for a log of an arm",
+        )
     fitting = [unit for unit in SECONDS if RATES[0] <= 1.0 / (median * UNITS[unit]) <= RATES[1]]
     in_seconds, span = 1.0 / median, float(np.ptp(t))
     whole = bool(np.all(t == np.round(t)))
     if 0.5 <= in_seconds < RATES[0] and not whole:
         slow = in_seconds >= SLOW or span * UNITS["ms"] < SHORT or not fitting
         unit, other = ("s", "ms") if slow else ("ms", "s")
-        return unit, 1.0 / (median * UNITS[unit]), f"EDIT: {1.0 / (median * UNITS[unit]):.6g} Hz if in {unit}, {1.0 / (median * UNITS[other]):.6g} Hz in {other}"
+        return (
+            unit,
+            1.0 / (median * UNITS[unit]),
+            f"EDIT: {1.0 / (median * UNITS[unit]):.6g} Hz if in {unit}, {1.0 / (median * UNITS[other]):.6g} Hz in {other}",
+        )
     unit = fitting[0] if fitting else "s"
     return unit, 1.0 / (median * UNITS[unit]), "" if fitting else f"EDIT: {in_seconds:.6g} Hz if in s"
 

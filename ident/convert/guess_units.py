@@ -78,7 +78,11 @@ def guess_scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate
     out: dict[str, Scale] = {}
     velocity = None
     # A drive that reports torque before the gear mostly reports its position there too.
-    before = "tau" in chosen and _before_gear(chosen["tau"], _torque_unit(chosen["tau"], linear), arm) and bool(np.mean(_turned(chosen.get("q"))) >= 0.5)
+    before = (
+        "tau" in chosen
+        and _before_gear(chosen["tau"], _torque_unit(chosen["tau"], linear), arm)
+        and bool(np.mean(_turned(chosen.get("q"))) >= 0.5)
+    )
     for channel in ("q", "q_ref", "q_link"):
         if channel in chosen:
             out[channel] = _position(chosen[channel], arm, linear, rate, before and channel != "q_link")
@@ -98,12 +102,16 @@ def _before_gear(torque: Family, unit: str, arm: Robot) -> bool:
 
     Between three hundredths of the limit and a little more than it is where torques of a log lie.
     """
-    ratio, share = np.abs(arm.array("gear_ratio")), np.abs(torque.x * UNITS[unit]).max(axis=0) / arm.array("torque_limit")
+    ratio, share = (
+        np.abs(arm.array("gear_ratio")),
+        np.abs(torque.x * UNITS[unit]).max(axis=0) / arm.array("torque_limit"),
+    )
     return bool(np.any(ratio > 3) and np.median(share) < 0.1 and 0.03 < np.median(share * ratio) < 3.0)
 
 
 def _turned(position: Family | None) -> np.ndarray:
-    """(n,) whether a motion turns round often enough to tell of its torque: one that goes one way shows friction as gravity."""
+    """(n,) whether a motion turns round often enough to tell of its torque: one that goes one way shows friction as
+    gravity."""
     if position is None or len(position.x) < SAMPLES:
         return np.zeros(1 if position is None else position.x.shape[1], bool)
     x = position.x[:: max(1, len(position.x) // LOOKED_AT)]
@@ -131,7 +139,8 @@ def _unit_of(family: Family, allowed: Sequence[str]) -> str | None:
 
 
 def unwrapped(family: Family) -> Family:
-    """Angles that jump by a full turn, going on over it; as they are where they do not, or where they jump otherwise too."""
+    """Angles that jump by a full turn, going on over it; as they are where they do not, or where they jump otherwise
+    too."""
     named = _unit_of(family, tuple(TURNS))
     for unit in (named,) if named else TURNS:
         turn, size = TURNS[unit], np.abs(np.diff(family.x, axis=0))
@@ -177,7 +186,11 @@ def _position(family: Family, arm: Robot, linear: np.ndarray, rate: float | None
     if rival is not None:
         note += f"; EDIT? {rival[0]} on the {rival[1]} side fits as well"
     if family.wraps:
-        note += "; wraps at a full turn: EDIT? by an offset, if it began in another one" if side == "motor" else "; wraps at a full turn"
+        note += (
+            "; wraps at a full turn: EDIT? by an offset, if it began in another one"
+            if side == "motor"
+            else "; wraps at a full turn"
+        )
     return Scale(factor, _options(unit, side) + wraps, note)
 
 
@@ -195,7 +208,9 @@ def _velocity(family: Family, velocity: np.ndarray | None, arm: Robot, linear: n
                     factor = sign * UNITS[unit] / (arm.array("gear_ratio") if side == "motor" else np.ones(arm.n))
                     if np.any(moving) and np.all(np.abs(slope / factor - 1)[moving] < 0.15):
                         return Scale(factor, _options(unit, side, sign), "the derivative of q says so")
-    return Scale(np.ones(arm.n), _options(choices[0], "link"), "EDIT: this is not the derivative of q in any usual unit")
+    return Scale(
+        np.ones(arm.n), _options(choices[0], "link"), "EDIT: this is not the derivative of q in any usual unit"
+    )
 
 
 def _torque_unit(family: Family, linear: np.ndarray) -> str:
@@ -203,18 +218,24 @@ def _torque_unit(family: Family, linear: np.ndarray) -> str:
     return unit or ("A" if family.has(CURRENTS) else "N" if np.all(linear) else "N m")
 
 
-def _torque(family: Family, position: Family | None, scale: Scale | None, arm: Robot, linear: np.ndarray, rate: float) -> Scale:
+def _torque(
+    family: Family, position: Family | None, scale: Scale | None, arm: Robot, linear: np.ndarray, rate: float
+) -> Scale:
     unit, side = _torque_unit(family, linear), "link"
     factor = np.full(arm.n, UNITS[unit])
     share = float(np.median(np.abs(family.x * factor).max(axis=0) / arm.array("torque_limit")))
     options, notes = [], [range_text(family.x)]
     if unit in ELECTRIC:
         options.append("torque_constant = 1.0")
-        notes.append(f"EDIT: the torque constant, the side that it is for, or the unit if this is a {'force' if np.all(linear) else 'torque'} after all")
+        notes.append(
+            f"EDIT: the torque constant, the side that it is for, or the unit if this is a {'force' if np.all(linear) else 'torque'} after all"
+        )
     turned = np.broadcast_to(_turned(position), arm.n)
     before = _before_gear(family, unit, arm)
     if before and np.mean(turned) < 0.5:
-        notes.append(f'EDIT: {share:.2g} of the torque limit: before the gear (side = "motor")? The motion turns round too seldom to tell')
+        notes.append(
+            f'EDIT: {share:.2g} of the torque limit: before the gear (side = "motor")? The motion turns round too seldom to tell'
+        )
     elif before:
         side, factor = "motor", factor * arm.array("gear_ratio")
         notes.append(f"EDIT? {share:.2g} of the torque limit: before the gear by its size")
@@ -226,12 +247,18 @@ def _torque(family: Family, position: Family | None, scale: Scale | None, arm: R
     if position is not None and scale is not None:
         signs = _friction_sign(position.x * scale.factor, family.x * factor, rate, turned)
         if not np.all(turned):
-            which = "all joints" if not np.any(turned) else "joints " + ", ".join(str(j + 1) for j in np.flatnonzero(~turned))
+            which = (
+                "all joints"
+                if not np.any(turned)
+                else "joints " + ", ".join(str(j + 1) for j in np.flatnonzero(~turned))
+            )
             notes.append(f"EDIT? signs as they stand: {which} turn round too seldom for friction to tell")
     options = [*_options(unit, side), *options]
     if np.any(signs < 0):
         options.append("sign = -1")
-        notes.append("sign by friction, which must brake: joints " + ", ".join(str(j + 1) for j in np.flatnonzero(signs < 0)))
+        notes.append(
+            "sign by friction, which must brake: joints " + ", ".join(str(j + 1) for j in np.flatnonzero(signs < 0))
+        )
     return Scale(factor * signs, tuple(options), "; ".join(notes), signs)
 
 

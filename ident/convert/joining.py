@@ -39,8 +39,14 @@ def on_one_clock(
     soonest = min(clocks, key=lambda k: clocks[k].t[-1])
     start, end = float(clocks[last].t[0]), float(clocks[soonest].t[-1])
     if (end - start) * m.sample_rate < SHORTEST - 1:
-        found = f"{paths[soonest].name} ends {start - end:.4g} s before {paths[last].name} begins" if end < start else f"{end - start:.3g} s in common"
-        raise DataError("time of [files]", str(paths[last]), found, "spans that overlap (shift = seconds in [files] moves one)")
+        found = (
+            f"{paths[soonest].name} ends {start - end:.4g} s before {paths[last].name} begins"
+            if end < start
+            else f"{end - start:.3g} s in common"
+        )
+        raise DataError(
+            "time of [files]", str(paths[last]), found, "spans that overlap (shift = seconds in [files] moves one)"
+        )
     t = uniform_times(start, end, m.sample_rate)
     out = dict(data)
     for f in m.files:
@@ -52,9 +58,13 @@ def on_one_clock(
             k = 0 if x is None or x.shape[1] == 1 else c.joint if c.index is None else c.index
             if x is not None and k < x.shape[1]:
                 # Before samples are put between: halfway between two ends of a turn is nowhere.
-                signals[c.source] = np.concatenate([x[:, :k], np.unwrap(x[:, [k]], period=c.turn, axis=0), x[:, k + 1 :]], axis=1)
+                signals[c.source] = np.concatenate(
+                    [x[:, :k], np.unwrap(x[:, [k]], period=c.turn, axis=0), x[:, k + 1 :]], axis=1
+                )
         if signals and not at_times(clock, t, m.sample_rate):
-            say(f"{paths[f.prefix].name}: {changed(clock, np.concatenate(list(signals.values()), axis=1), len(t), m.sample_rate)}")
+            say(
+                f"{paths[f.prefix].name}: {changed(clock, np.concatenate(list(signals.values()), axis=1), len(t), m.sample_rate)}"
+            )
             signals = {k: resample(x, clock, t, m.sample_rate) for k, x in signals.items()}
         out |= signals
     return out, list(clocks.values()), start

@@ -71,8 +71,13 @@ def read_layout(path: Path) -> Layout:
     delimiter = _delimiter(first, rows[1] if len(rows) > 1 else first)
     words = _words(first, delimiter)
     names, units, start = words, (), skipped
-    # A header may be a comment itself: "# t q tau", above "# s rad Nm"; its row may hold texts, "%time,name,q" those of ROS.
-    said = [w for w in (_words(c.lstrip("#% \t"), delimiter) for c in comments) if len(w) == len(words) and not any(map(_value, w))]
+    # A header may be a comment itself: "# t q tau", above "# s rad Nm"; its row may hold texts, "%time,name,q" those of
+    # ROS.
+    said = [
+        w
+        for w in (_words(c.lstrip("#% \t"), delimiter) for c in comments)
+        if len(w) == len(words) and not any(map(_value, w))
+    ]
     if _row(words) or (said and len(words) > 1 and any(map(_value, words))):
         units = said.pop() if len(said) == 2 and _units(said[1]) else ()
         names = said[-1] if said else ()
@@ -102,7 +107,9 @@ def _header(rows: list[str]) -> int:
         if len(names) < 2 or (i and any(map(_value, names))) or not all(_as_many(len(names), w) for w in rest):
             continue
         head = rest[1] if _units(rest[0]) and len(rest) > 1 else rest[0]
-        if any(map(_value, head)) and all(_value(a) or not a for a, z in zip(head, rest[-1], strict=False) if _value(z)):
+        if any(map(_value, head)) and all(
+            _value(a) or not a for a, z in zip(head, rest[-1], strict=False) if _value(z)
+        ):
             return k
     return 0
 
@@ -130,7 +137,8 @@ def _encoding(path: Path) -> str:
 
 
 def _comment(line: str) -> bool:
-    """Whether a line before the header says nothing: a comment, a blank one, or the delimiter, as spreadsheets have it."""
+    """Whether a line before the header says nothing: a comment, a blank one, or the delimiter, as spreadsheets have
+    it."""
     start = line.lstrip()
     return not start or start[0] in "#%" or start.lower().startswith("sep=")
 

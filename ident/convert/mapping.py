@@ -92,8 +92,8 @@ class LogMap:
         sample_rate: Hz, of the dataset. time_factor: s per unit of the time column.
         time_plus: (source, s per unit) of what is added to it: full seconds with their fraction beside them.
         files: where a log is spread over several; else empty.
-        roles: file name or its stem -> role; whole: whether each must be of a file given. split: share of a file without a role that is for
-            identification, the rest validates.
+        roles: file name or its stem -> role; whole: whether each must be of a file given. split: share of a file
+            without a role that is for identification, the rest validates.
     """
 
     sample_rate: float
@@ -137,7 +137,9 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
     if shipped:
         file = SHIPPED / f"{path}.toml"
     if not exists(file):
-        raise DataError("map", str(path), "no such file", f"a map, or one of {sorted(p.stem for p in SHIPPED.glob('*.toml'))}")
+        raise DataError(
+            "map", str(path), "no such file", f"a map, or one of {sorted(p.stem for p in SHIPPED.glob('*.toml'))}"
+        )
     where = str(file)
     data = read_toml(file, "map")
     _known(data, KEYS, "", where)
@@ -149,7 +151,9 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
     for channel in ("tau", "q"):
         for j in range(len(ratios)):
             if (channel, j) not in have:
-                raise DataError(f"{channel}_{j + 1}", where, "no such column", f"{channel}_1 to {channel}_{len(ratios)}")
+                raise DataError(
+                    f"{channel}_{j + 1}", where, "no such column", f"{channel}_1 to {channel}_{len(ratios)}"
+                )
     time = subtable(data, "time", where)
     _known(time, TIME_KEYS, "time.", where)
     multisine = subtable(data, "multisine", where)
@@ -163,14 +167,18 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
             found = f"period {b.first} for {a.role} and for {b.role}"
             raise DataError("[[multisine.part]]", where, found, "held-out periods that nothing is fitted to")
     lines = multisine.get("excited_lines", [])
-    if not isinstance(lines, list) or not all(isinstance(k, int) and not isinstance(k, bool) and 0 < k < 2**53 for k in lines):
+    if not isinstance(lines, list) or not all(
+        isinstance(k, int) and not isinstance(k, bool) and 0 < k < 2**53 for k in lines
+    ):
         raise DataError("multisine.excited_lines", where, show(lines), "whole numbers from 1")
     period = whole(multisine, "period", where, low=4) if multisine else None
     if period is not None and lines and max(lines) >= period / 2:
         raise DataError("multisine.excited_lines", where, f"line {max(lines)}", f"lines below Nyquist, {period / 2:g}")
     roles = subtable(data, "roles", where)
     if roles and period is not None:
-        raise DataError("[roles]", where, "[multisine] as well", "role in [[multisine.part]]: it is that of each segment")
+        raise DataError(
+            "[roles]", where, "[multisine] as well", "role in [[multisine.part]]: it is that of each segment"
+        )
     files = tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items())
     source = text(time, "source", f"{where} time") if "time" in data else None
     factor = unit_factor(time.get("unit", "s"), TIMES, "time", where)
@@ -227,7 +235,12 @@ def _file(prefix: str, entry: Any, where: str) -> FilePart:
     if isinstance(entry, str):
         entry = {"name": entry}
     if not isinstance(entry, dict):
-        raise DataError(f"files.{prefix}", where, show(entry), '"name of a file" or { name = "...", width = 7, time = "t", unit = "s" }')
+        raise DataError(
+            f"files.{prefix}",
+            where,
+            show(entry),
+            '"name of a file" or { name = "...", width = 7, time = "t", unit = "s" }',
+        )
     _known(entry, FILE_KEYS, f"files.{prefix}.", where)
     here = f"{where} files.{prefix}"
     return FilePart(
@@ -264,7 +277,12 @@ def _column(key: str, entry: Any, ratios: np.ndarray, linear: np.ndarray, where:
     if ratio == 0 or factor == 0:
         raise DataError(key, where, "a factor of zero", "gear, sign, scale and torque_constant other than zero")
     if abs(factor) < SMALLEST or abs(ratio) < SMALLEST:
-        raise DataError(key, where, f"a factor of {min(abs(factor), abs(ratio)):.3g}", f"unit, sign, scale, torque_constant and gear of at least {SMALLEST:g} in all")
+        raise DataError(
+            key,
+            where,
+            f"a factor of {min(abs(factor), abs(ratio)):.3g}",
+            f"unit, sign, scale, torque_constant and gear of at least {SMALLEST:g} in all",
+        )
     # Torques grow by the gear ratio on the way to the link, angles shrink; a temperature has no side.
     factor *= ratio if channel in ("tau", "r") else 1.0 if channel == "temp" else 1.0 / ratio
     unwrap = entry.get("unwrap", False)
@@ -281,5 +299,8 @@ def _column(key: str, entry: Any, ratios: np.ndarray, linear: np.ndarray, where:
         number(entry, "offset", here, default=0.0),
         whole(entry, "index", here, low=0, default=None),
         turn if unwrap else None,
-        tuple((text(p, "source", here), number(p, "factor", here), whole(p, "index", here, low=0, default=None)) for p in plus),
+        tuple(
+            (text(p, "source", here), number(p, "factor", here), whole(p, "index", here, low=0, default=None))
+            for p in plus
+        ),
     )

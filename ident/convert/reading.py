@@ -78,7 +78,9 @@ def survey_log(path: Path) -> Survey:
     dates, doubts = set(), {}
     rows = [0]
     text = READERS.get(path.suffix.lower()) is read_text
-    for name, value in (_read(path, None, lambda p, _: _surveyed(p, doubts, rows)) if text else _read(path, None)).items():
+    for name, value in (
+        _read(path, None, lambda p, _: _surveyed(p, doubts, rows)) if text else _read(path, None)
+    ).items():
         x = _array(value)
         if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
@@ -149,7 +151,11 @@ def _read(path: Path, wanted: set[str] | None, by: Reader | None = None) -> dict
 
 def _reason(err: Exception) -> str:
     """The first line of an error, without the address of a Python object."""
-    return re.sub(r"<[^<>]* at 0x[0-9a-f]+>", "the file", str(err)).splitlines()[0][:160] if str(err).strip() else type(err).__name__
+    return (
+        re.sub(r"<[^<>]* at 0x[0-9a-f]+>", "the file", str(err)).splitlines()[0][:160]
+        if str(err).strip()
+        else type(err).__name__
+    )
 
 
 def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
@@ -160,10 +166,15 @@ def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     stored = 0
     for g in range(file.metadata.num_row_groups):
         columns = (file.metadata.row_group(g).column(k) for k in range(file.metadata.num_columns))
-        stored += sum(c.num_values for c in columns if c.path_in_schema.split(".")[0] in names or c.path_in_schema in names)
+        stored += sum(
+            c.num_values for c in columns if c.path_in_schema.split(".")[0] in names or c.path_in_schema in names
+        )
     check_size(path, 8 * max(stored, file.metadata.num_rows * len(names)))
     table = file.read(columns=names)
-    out = {n: _lists(table.column(n)) if _is_list(table.column(n).type) else as_dates(table.column(n)) for n in table.column_names}
+    out = {
+        n: _lists(table.column(n)) if _is_list(table.column(n).type) else as_dates(table.column(n))
+        for n in table.column_names
+    }
     return {n: x for n, x in out.items() if x is not None or wanted is not None}
 
 
@@ -186,7 +197,10 @@ def _holds_numbers(kind: pa.DataType) -> bool:
         kind = kind.value_type
     if _is_list(kind):
         return any(test(kind.value_type) for test in NUMBERS)
-    return any(test(kind) for test in (*NUMBERS, pa.types.is_boolean, pa.types.is_temporal, pa.types.is_string, pa.types.is_large_string))
+    return any(
+        test(kind)
+        for test in (*NUMBERS, pa.types.is_boolean, pa.types.is_temporal, pa.types.is_string, pa.types.is_large_string)
+    )
 
 
 def _npz(path: Path, wanted: set[str] | None) -> dict[str, Any]:

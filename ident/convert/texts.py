@@ -43,7 +43,8 @@ def read_text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
 
 
 def scan_text(path: Path, wanted: set[str] | None) -> list[Cells]:
-    """Columns as they were read. Where all are wanted (None), those of texts are left out, and a long log is read in part."""
+    """Columns as they were read. Where all are wanted (None), those of texts are left out, and a long log is read in
+    part."""
     layout = read_layout(path)
     if layout.names:
         keep = {i: n for i, n in enumerate(layout.names) if n and (wanted is None or wanted_name(n, wanted) in wanted)}
@@ -101,7 +102,9 @@ def _batches(path: Path, layout: Layout, keep: list[int]) -> Iterator[pa.RecordB
     options = {
         "parse_options": pa.csv.ParseOptions(delimiter=layout.delimiter or " "),
         "convert_options": pa.csv.ConvertOptions(
-            include_columns=[str(i) for i in keep], column_types={str(i): pa.string() for i in keep}, strings_can_be_null=True
+            include_columns=[str(i) for i in keep],
+            column_types={str(i): pa.string() for i in keep},
+            strings_can_be_null=True,
         ),
     }
     names = [str(i) for i in range(layout.columns)]
@@ -114,12 +117,15 @@ def _batches(path: Path, layout: Layout, keep: list[int]) -> Iterator[pa.RecordB
             if uneven is None:
                 raise
             at = f" in line {line + int(uneven[1])}" if uneven[1] else ""
-            raise DataError("row", str(path), f"{uneven[3]} columns{at}: {uneven[4][:60]!r}", f"{uneven[2]} as in the rows above") from err
+            raise DataError(
+                "row", str(path), f"{uneven[3]} columns{at}: {uneven[4][:60]!r}", f"{uneven[2]} as in the rows above"
+            ) from err
         yield from table.to_batches()
 
 
 def _pieces(path: Path, layout: Layout) -> Iterator[tuple[int, bytes]]:
-    """Whole lines of the rows with the number of lines before them; of blanks only one between words, and comments left out."""
+    """Whole lines of the rows with the number of lines before them; of blanks only one between words, and comments left
+    out."""
     with path.open(encoding=layout.encoding, errors="replace", newline=None) as file:
         for _ in range(layout.start):
             file.readline(LONGEST_LINE)

@@ -52,7 +52,9 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         out += [make(j, name) for make in PER_JOINT]
         if not linear[j]:  # what errs once a turn
             out.append(sensing.encoder_eccentricity(j, name))
-        out.append(transmission.backlash(j, name, max(robot.joints[j].damping / robot.joints[j].stiffness, LEAST_DAMPING)))
+        out.append(
+            transmission.backlash(j, name, max(robot.joints[j].damping / robot.joints[j].stiffness, LEAST_DAMPING))
+        )
         out.append(link_springs.dress_pack(j, name, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.rising_friction(j, name))
@@ -80,7 +82,9 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     for j, name in enumerate(names):
         # Before the first joint it would be the base that moves.
         for before in (False, True)[: 1 + (j > 0)]:
-            out += [hinges.compliance(name, j, axes, "transverse_elasticity", before) for axes in _turned(_across(chain, j))]
+            out += [
+                hinges.compliance(name, j, axes, "transverse_elasticity", before) for axes in _turned(_across(chain, j))
+            ]
     if robot.n > 1 and np.any(robot.gravity):  # of a single joint it is a body whose centre is elsewhere
         out.append(structure.leaning_base())
     out += [hinges.compliance("base", -1, axes, "base_elasticity") for axes in _turned(np.eye(3))]

@@ -24,7 +24,8 @@ LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a lin
 def payload(link: str) -> Hypothesis:
     """Unknown load with its centre of mass at ``com`` in the frame of the flange's link.
 
-    Its inertia about the centre is that of a body along the axes of the frame: what a ball would leave, a wrong link takes up.
+    Its inertia about the centre is that of a body along the axes of the frame: what a ball would leave, a wrong link
+    takes up.
     """
 
     def change(p) -> Change:
@@ -63,10 +64,13 @@ def payload(link: str) -> Hypothesis:
 
 
 def payload_like(link: str, without: Structure, changed: Structure) -> np.ndarray | None:
-    """Parameters of a ``payload`` that has the mass and first moment by which the body of a link differs in two chains; None where
+    """Parameters of a ``payload`` that has the mass and first moment by which the body of a link differs in two chains;
+    None where
     it has become lighter."""
     joint, placement = without.bodies[link]
-    mass, *moment = (changed.model.inertias[joint].toDynamicParameters() - without.model.inertias[joint].toDynamicParameters())[:4]
+    mass, *moment = (
+        changed.model.inertias[joint].toDynamicParameters() - without.model.inertias[joint].toDynamicParameters()
+    )[:4]
     if mass <= 0.0:
         return None
     com = placement.actInv(np.array(moment) / mass)

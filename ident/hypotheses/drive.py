@@ -22,7 +22,8 @@ def scale_of(weight: float) -> float:
 
 
 def over_gain(U: np.ndarray, gain: np.ndarray, motion: Motion) -> np.ndarray:
-    """Recorded torque (..., L) of which a motor delivers ``U`` (..., L), by a gain (S, T) that changes along the record."""
+    """Recorded torque (..., L) of which a motor delivers ``U`` (..., L), by a gain (S, T) that changes along the
+    record."""
     return U + motion.lines((1.0 / gain - 1.0) * in_time(U, motion))
 
 
@@ -112,12 +113,12 @@ def torque_saturation(joint: int, place: str, wound_up: bool = False) -> Hypothe
     """Delivered torque is clipped at ``limit``, which takes no more than the peaks.
 
     An amplifier that limits by a controller of its own bends before it does: ``u (1 + |u / limit|^(1 / knee))^-knee``, which
-    clips sharply where the knee is small, and takes 2 % at two thirds of the limit where it is largest. A limit near zero would deliver
-    nothing, and so explain any motor that hardly moves.
+    clips sharply where the knee is small, and takes 2 % at two thirds of the limit where it is largest. A limit near
+    zero would deliver nothing, and so explain any motor that hardly moves.
 
     Args:
-        wound_up: whether the loop asks for many times what it gets in single motions: for a fifth of all that was recorded, and for half of
-            a motion, at most.
+        wound_up: whether the loop asks for many times what it gets in single motions: for a fifth of all that was
+            recorded, and for half of a motion, at most.
     """
 
     def excess(limit: float, knee: float, motion: Motion, j: int) -> np.ndarray:
@@ -150,7 +151,8 @@ def torque_saturation(joint: int, place: str, wound_up: bool = False) -> Hypothe
 
 
 def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothesis:
-    """``amplitude sin(periods_per_rev q + phase)`` that drives the motor, as MuJoCo's own element does, with a second harmonic."""
+    """``amplitude sin(periods_per_rev q + phase)`` that drives the motor, as MuJoCo's own element does, with a second
+    harmonic."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         sine, n, cosine, *second = p
@@ -183,7 +185,8 @@ def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothe
 
 
 def torque_ripple(joint: int, place: str) -> Hypothesis:
-    """Decoy: a ripple that grows with the torque, ``1 + fraction sin(periods_per_rev q + phase)`` times the recorded one.
+    """Decoy: a ripple that grows with the torque, ``1 + fraction sin(periods_per_rev q + phase)`` times the recorded
+    one.
 
     So do the flux of a motor and currents that are measured with an error of their scale.
     """

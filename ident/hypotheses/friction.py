@@ -17,7 +17,8 @@ from ident.motion import Motion
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
 ASYMMETRY_SPREAD = 0.4  # before the data: most joints rub alike both ways
 REST_QUANTILE = 0.95  # of what a friction balances at rest, that says its size
-RESOLVED = 2.0  # velocity within which a friction turns over the noise of that which is seen, from which no rest is needed to know it
+# velocity within which a friction turns over the noise of that which is seen, from which no rest is needed to know it
+RESOLVED = 2.0
 AT_ONCE, SEEN_TO_TURN = 0.1, 2.0  # the same over that velocity, of frictions begun on either side of it
 SEEN = 3.0  # size of a friction over the noise of what is asked of it, below which rest tells nothing of it
 LEAST_TORQUE = 1e-12  # N m
@@ -29,7 +30,8 @@ RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
 PROJECTIONS = 2  # of what is asked at rest, onto what dry friction can be
-RELAXATION = Parameter("relaxation", "s", 0.0, 1.0, nuisance=True, center=0.0, spread=0.01, null=0.0, reported=True)  # of a bristle
+# of a bristle
+RELAXATION = Parameter("relaxation", "s", 0.0, 1.0, nuisance=True, center=0.0, spread=0.01, null=0.0, reported=True)
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
 
 
@@ -55,10 +57,11 @@ def dry(
     size: np.ndarray | float,
     back: np.ndarray | float | None = None,
 ) -> np.ndarray:
-    """Dry friction (S, T), N m: its ``size`` in the direction of the motion; where the motor stands still what balances the drive.
+    """Dry friction (S, T), N m: its ``size`` in the direction of the motion; where the motor stands still what balances
+    the drive.
 
-    At rest dry friction is whatever the drive asks of it, up to its size (Coulomb 1785): no history of the velocity tells
-    it, and the recorded torque does, where it shows more than noise.
+    At rest dry friction is whatever the drive asks of it, up to its size (Coulomb 1785): no history of the velocity
+    tells it, and the recorded torque does, where it shows more than noise.
 
     Args:
         back: the size in the other direction; the same where None.
@@ -74,8 +77,8 @@ def dry(
         return moving
     asked, least, most = motion.asked(j), -np.abs(back), np.abs(size)
     friction = np.where(rest, np.clip(asked, least, most), moving)
-    # Of what is asked only some lines are known, and its jumps ring: what has these lines within the limits is sought, by projection
-    # onto one and the other in turn (Papoulis 1975).
+    # Of what is asked only some lines are known, and its jumps ring: what has these lines within the limits is sought,
+    # by projection onto one and the other in turn (Papoulis 1975).
     for _ in range(PROJECTIONS):
         missing = asked - motion.group.to_time(motion.lines(friction)[..., None])[..., 0]
         friction = np.where(rest, np.clip(friction + missing, least, most), moving)
@@ -94,7 +97,8 @@ def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
 
 
 def resting(motion: Motion, j: int, smoothing: float) -> np.ndarray | None:
-    """Where a motor stands still (S, T); None where it never does, that is not known, or a turn within ``smoothing`` rad/s is seen without."""
+    """Where a motor stands still (S, T); None where it never does, that is not known, or a turn within ``smoothing``
+    rad/s is seen without."""
     rest = motion.group.rest
     if rest is None or j in motion.told or not np.any(rest[..., j]):
         return None
@@ -103,11 +107,14 @@ def resting(motion: Motion, j: int, smoothing: float) -> np.ndarray | None:
 
 
 def other_turn(groups: Sequence[Group], j: int, smoothing: float) -> float | None:
-    """Velocity within which a friction turns, rad/s, from which no step leads to ``smoothing``; None where no motor is seen to rest.
+    """Velocity within which a friction turns, rad/s, from which no step leads to ``smoothing``; None where no motor is
+    seen to rest.
 
     Rest tells a friction that turns at once, and not one that turns within a velocity that is seen.
     """
-    known = [RESOLVED * g.turn_noise[j] for g in groups if g.window is None and g.rest is not None and np.any(g.rest[..., j])]
+    known = [
+        RESOLVED * g.turn_noise[j] for g in groups if g.window is None and g.rest is not None and np.any(g.rest[..., j])
+    ]
     if not known:
         return None
     return AT_ONCE * min(known) if smoothing > min(known) else SEEN_TO_TURN * max(known)
@@ -125,7 +132,8 @@ def held_at_start(motion: Motion, j: int, size: float) -> np.ndarray | None:
 
 
 def turns(scale: SignalScale) -> list[tuple[float]]:
-    """Velocities within which a friction may turn, rad/s: at once, so that rest tells it where the motor sticks, or smoothly."""
+    """Velocities within which a friction may turn, rad/s: at once, so that rest tells it where the motor sticks, or
+    smoothly."""
     return [(f * scale.v,) for f in (1e-5, 2e-3, 0.05)]
 
 
@@ -220,8 +228,8 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
 def presliding_friction(joint: int, place: str) -> Hypothesis:
     """Spring of ``stiffness`` before it slips at ``coulomb``: Dahl's bristle, or a sharper one (see ``yielding``).
 
-    Its bending is damped by ``relaxation`` times the stiffness, as in the LuGre model, whose ``sigma_1`` this is (Canudas de Wit,
-    Olsson, Astrom and Lischinsky, IEEE Trans. Automatic Control 40, 1995).
+    Its bending is damped by ``relaxation`` times the stiffness, as in the LuGre model, whose ``sigma_1`` this is
+    (Canudas de Wit, Olsson, Astrom and Lischinsky, IEEE Trans. Automatic Control 40, 1995).
     """
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
@@ -261,7 +269,9 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             "give": lambda p: p[1] / p[0],
             "trivial": lambda p, k: p[1] > MOST_GIVE * p[0],
             "special": lambda p: np.array([p[1], 0.0, SHARP]),
-            "widens": lambda p, s: [np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL, 0.0]) for f in (0.02, 0.2)],
+            "widens": lambda p, s: [
+                np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL, 0.0]) for f in (0.02, 0.2)
+            ],
         },
     )
 
@@ -402,7 +412,8 @@ def rising_friction(joint: int, place: str) -> Hypothesis:
 
 
 def position_friction(joint: int, place: str) -> Hypothesis:
-    """Decoy: friction whose size depends on the position of the joint, ``(constant + slope q + curvature q^2) sign(v)``."""
+    """Decoy: friction whose size depends on the position of the joint, ``(constant + slope q + curvature q^2)
+    sign(v)``."""
 
     def units(motion: Motion, j: int, smoothing: float) -> tuple[np.ndarray, ...]:
         q, s = motion.q(j), sense(motion, j, smoothing)

@@ -16,7 +16,8 @@ from robot_assets.robot import Elasticity
 
 STIFFEST = 1e12  # N m/rad, of a hinge
 RESONANCES = 0.06, 0.12, 0.22, 0.35, 0.55, 0.85, 5.0  # of a hinge, over the highest line: far above it all answer alike
-MOST_TILT = 3.0  # of an elastic axis towards each other axis, in units of that along the one from which it is sought in a fit
+# of an elastic axis towards each other axis, in units of that along the one from which it is sought in a fit
+MOST_TILT = 3.0
 
 
 def compliance(
@@ -40,14 +41,19 @@ def compliance(
         along = np.concatenate([[1.0], np.asarray(p)[2:]])
         i = int(np.argmax(np.abs(along)))
         others = np.roll(along, -i)[1:] / along[i]
-        return (compliance(place, joint_index, (*axes[i:], *axes[:i]), effect, before), np.array([*p[:2], *others])) if i else None
+        return (
+            (compliance(place, joint_index, (*axes[i:], *axes[:i]), effect, before), np.array([*p[:2], *others]))
+            if i
+            else None
+        )
 
     def hinge(p: Sequence[float]) -> Elasticity:
         x, y, z = (float(v) for v in axis(p))
         return Elasticity(name, place, (x, y, z), float(p[0]), float(p[1]), before)
 
     def at(structure: Structure, group: Group, frequency: float, ratio: float, softer: float = 1.0) -> np.ndarray:
-        """Parameters with its own resonance at ``frequency`` (Hz), of that damping ``ratio``, its stiffness divided by ``softer``."""
+        """Parameters with its own resonance at ``frequency`` (Hz), of that damping ``ratio``, its stiffness divided by
+        ``softer``."""
         straight = np.zeros(len(tilts))
         own = hinge_inertia(structure, hinge([STIFFEST, 1.0, *straight]), group)
         stiffness = own * (2 * np.pi * frequency) ** 2 / softer

@@ -124,17 +124,23 @@ class Hypothesis:
         options: what single hypotheses need beyond that. ``size(scale)`` gives parameters of a strong effect
             to start from where no linear step leads there. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
-            place of one with parameters ``old`` at the same joint, ``widens(old, scale)`` starts to try of other shapes. ``apart``: the parameter that sets it apart from that
-            special case, and ``special(p)`` the parameters of the special case that it is where the data do not show this
-            one, or where ``give(p)``, rad, is less than the noise of the position. ``essential`` names the parameters without
-            any of which nothing is left of the effect, ``trivial(p, stiffness)`` says so of all parameters together, beside a gear of that stiffness. ``bends``: the
-            arm may have several steady motions with it; ``bends(p, factor, stiffness)`` gives parameters of another size that do
+            place of one with parameters ``old`` at the same joint, ``widens(old, scale)`` starts to try of other
+            shapes. ``apart``: the parameter that sets it apart from that special case, and ``special(p)`` the
+            parameters of the special case that it is where the data do not show this one, or where ``give(p)``, rad, is
+            less than the noise of the position. ``essential`` names the parameters without any of which nothing is left
+            of the effect, ``trivial(p, stiffness)`` says so of all parameters together, beside a gear of that
+            stiffness. ``bends``: the arm may have several steady motions with it; ``bends(p, factor, stiffness)`` gives
+            parameters of another size that do
             about the same. ``dry``: a friction that at rest balances what is asked of it.
             ``nats``: log odds before the data, 0 where there is no reason. ``body``: the link whose inertia it changes.
-            ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a spring.
-            ``filter(p, s)``: recorded torque per delivered one, or true position per measured one, of one that is linear, (L,).
-            ``nearer(p)``: the hypothesis of the same hinge sought from another axis, and its parameters, where its own is nearer to that.
-            ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value there.
+            ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a
+            spring.
+            ``filter(p, s)``: recorded torque per delivered one, or true position per measured one, of one that is
+                linear, (L,).
+            ``nearer(p)``: the hypothesis of the same hinge sought from another axis, and its parameters, where its own
+                is nearer to that.
+            ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value
+                there.
     """
 
     effect: str

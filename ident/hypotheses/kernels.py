@@ -1,7 +1,7 @@
 """Laws of friction and of gears along time, in compiled code.
 
-Those with memory are stepped. Each takes (S, T) signals over one period and returns the periodic steady state: the period is run
-again until it repeats (friction elements forget in one).
+Those with memory are stepped. Each takes (S, T) signals over one period and returns the periodic steady state: the
+period is run again until it repeats (friction elements forget in one).
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ class Law(NamedTuple):
     """A law of the gear, or of a cable on a link.
 
     Attributes:
-        code: which; a, b: its parameters. ``BACKLASH`` takes ``k x`` within a dead band ``a`` wide, and a damper ``b`` with it;
-            ``HYSTERESIS`` yields at ``b`` after a stiffness ``a``; ``LINK`` is ``a x + b tanh(x' / k)`` on a link; ``CABLE`` is ``a x`` and a spring ``k`` that yields at ``b`` there.
+        code: which; a, b: its parameters. ``BACKLASH`` takes ``k x`` within a dead band ``a`` wide, and a damper ``b``
+            with it; ``HYSTERESIS`` yields at ``b`` after a stiffness ``a``; ``LINK`` is ``a x + b tanh(x' / k)`` on a
+            link; ``CABLE`` is ``a x`` and a spring ``k`` that yields at ``b`` there.
         k: linear stiffness of the gear, N m/rad.
         exponent, recoil: of an element that yields (see ``yielding``); a Maxwell slip where nothing is said.
-        start: torque of such an element where a motion begins, over that at which it yields: it was left by motions that were not
-            recorded. What repeats has none.
+        start: torque of such an element where a motion begins, over that at which it yields: it was left by motions
+            that were not recorded. What repeats has none.
     """
 
     code: int
@@ -65,7 +66,8 @@ def smooth_sign(v: np.ndarray, smoothing: float) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: float, h_old: float) -> float:
-    """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``; or of a ``CABLE``, see ``loop_sweep``, on a link."""
+    """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``; or of a ``CABLE``, see ``loop_sweep``, on a
+    link."""
     if code == 5:
         return a * x + min(max(h_old - a * x_old + k * (x - x_old), -b), b)
     if code == 0:
@@ -177,7 +179,8 @@ def along_deflection(
     mean: np.ndarray,
     bisections: int,
 ) -> np.ndarray:
-    """Torque beyond ``k x`` of a nonlinear gear along a deflection, moved to where the gear carries a mean torque; (S, T).
+    """Torque beyond ``k x`` of a nonlinear gear along a deflection, moved to where the gear carries a mean torque; (S,
+    T).
 
     What yields does not see where it is, only how it moves. Within a dead band that holds all of the motion many places
     carry none: bisection ends at the last of them. Of other laws false position finds the only one (Dowell and Jarratt,
@@ -255,7 +258,8 @@ def link_point(stiffness: float, friction: float, turn: float, q: float, v: floa
 
 @njit(cache=True, nogil=True)
 def loose_point(gap: float, damping: float, k: float, q: float, v: float, dq: float, dv: float) -> float:
-    """Torque ``h`` that takes spring and damper from a gear within its dead band: there ``-k x - damping x'`` at ``x = q - dq h``."""
+    """Torque ``h`` that takes spring and damper from a gear within its dead band: there ``-k x - damping x'`` at ``x =
+    q - dq h``."""
     h = -(k * q + damping * v) / max(1.0 - k * dq - damping * dv, 1e-6)
     if abs(q - dq * h) <= 0.5 * gap:
         return h
@@ -283,13 +287,14 @@ def loop_sweep(
 
     Args:
         code, a, b, k, exponent, recoil: as in ``Law``.
-        linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for laws that ask for it alone.
+        linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for laws that ask for it
+            alone.
         modes: (4, modes) complex: poles, decay, gain_old, gain_new.
         start: (modes, S) complex state of the modes one step before the period.
         memory: (3, S) deflection, the one before and torque there; replaced by those at the end.
         out: (T, S) torque, N m; that of an earlier sweep is replaced.
-        returns: step from which on the period is but a return to where it began, T where it is none: what yields is led to the
-            torque ``begin`` there, N m, smoothly, as a jump would swing the arm.
+        returns: step from which on the period is but a return to where it began, T where it is none: what yields is led
+            to the torque ``begin`` there, N m, smoothly, as a jump would swing the arm.
 
     Returns:
         (modes, S) state at the end, and (S,) largest change of the torque over the largest torque.
@@ -368,9 +373,7 @@ def loop_sweep(
     return end, change / largest
 
 
-def modal_compliance(
-    M: np.ndarray, D: np.ndarray, K: np.ndarray, column: int, dt: float
-) -> np.ndarray:
+def modal_compliance(M: np.ndarray, D: np.ndarray, K: np.ndarray, column: int, dt: float) -> np.ndarray:
     """Modes of ``[(s^2 M + s D + K)^{-1}]_{cc}``: poles, decay, gain_old, gain_new; (4, modes).
 
     Conjugate pairs are folded into one mode of twice the residue; a first-order hold over ``dt``.

@@ -29,7 +29,10 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
         place,
         joint,
         "link",
-        (Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True), Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, step=1e-3)),
+        (
+            Parameter("stiffness", "N m/rad", 1e-6, 1e9, log=True),
+            Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, step=1e-3),
+        ),
         lambda p, motion, j, k: p[0] * (motion.q_link(j) - p[1]),
         lambda scale: [()],
         screen,
@@ -61,7 +64,11 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
             return Screen((q, direction(v, turn)), start)
         return Screen((q, elastoplastic(q, 1.0 / max(give, 1e-12), 1.0, begins=motion.group.window is not None)), start)
 
-    own = (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START) if yields else (SMOOTHING,)
+    own = (
+        (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START)
+        if yields
+        else (SMOOTHING,)
+    )
     return Hypothesis(
         "dress_pack",
         place,
@@ -78,8 +85,13 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
         options={
-            "loop": lambda p: kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2], start=p[3]) if yields else kernels.Law(kernels.LINK, p[0], p[1], p[2]),
-            # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the motor.
+            "loop": lambda p: (
+                kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2], start=p[3])
+                if yields
+                else kernels.Law(kernels.LINK, p[0], p[1], p[2])
+            ),
+            # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the
+            # motor.
             "trivial": lambda p, k: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
             "absorb": lambda p, weights, old: np.array([old[0], *p[1:]]),

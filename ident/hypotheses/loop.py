@@ -8,7 +8,8 @@ from ident.hypotheses.kernels import CABLE, HYSTERESIS, LINK, Law, loop_sweep, s
 from ident.mixing import MEMORY, mixed
 
 SWEEPS = 25  # periods at most until the steady state
-STEADY = 1e-7  # change of the torque from one to the next, over the largest, that ends them: derivatives are differences
+# change of the torque from one to the next, over the largest, that ends them: derivatives are differences
+STEADY = 1e-7
 
 
 def steady_loop(
@@ -32,8 +33,8 @@ def steady_loop(
         linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for laws that see it alone.
         modes: (4, modes) complex, of ``kernels.modal_compliance``.
         guess: (modes, S) complex state from which to begin; rest where None.
-        returns: share of the period from which on it is but a return that closes a motion, in which what yields comes to the ``start``
-            of the law; 1 where there is none.
+        returns: share of the period from which on it is but a return that closes a motion, in which what yields comes
+            to the ``start`` of the law; 1 where there is none.
     """
     code, a, b, k = law[:4]
     S, T = linear.shape

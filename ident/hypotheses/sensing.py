@@ -78,9 +78,7 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q = turns * motion.q(j)
-        return Screen(
-            (-motion.lines(np.sin(q)), -motion.lines(np.cos(q))), lambda c: np.array(c)
-        )
+        return Screen((-motion.lines(np.sin(q)), -motion.lines(np.cos(q))), lambda c: np.array(c))
 
     return Hypothesis(
         "encoder_eccentricity",

@@ -1,4 +1,5 @@
-"""Changes of the chain itself, made by effects on channel "model": ``Change`` says how; gears that turn two joints, friction of a link, and a base that leans."""
+"""Changes of the chain itself, made by effects on channel "model": ``Change`` says how; gears that turn two joints,
+friction of a link, and a base that leans."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ DISTANT_NATS = 2.0  # against a gear that turns another joint than the next one
 
 @dataclass(frozen=True)
 class Change:
-    """A change of the chain: what ``build_structure`` and ``Parameters`` take, and ``tilt`` of gravity as of ``leaning``, rad."""
+    """A change of the chain: what ``build_structure`` and ``Parameters`` take, and ``tilt`` of gravity as of
+    ``leaning``, rad."""
 
     elasticities: tuple[Elasticity, ...] = ()
     loads: tuple[tuple[str, pin.Inertia], ...] = ()
@@ -110,7 +112,8 @@ def leaning(structure: Structure, tilt: Sequence[float]) -> Structure:
 
 
 def leaning_base() -> Hypothesis:
-    """Decoy: a base that is not level, or not mounted as the model says. It asks for gravity torques at all joints that bear any."""
+    """Decoy: a base that is not level, or not mounted as the model says. It asks for gravity torques at all joints that
+    bear any."""
 
     def responses(structure, par, plane, group, solution, shape):
         leant = [leaning(structure, tilt) for tilt in TILT_STEP * np.eye(2)]

@@ -41,7 +41,8 @@ def hardening_stiffness(joint: int, place: str) -> Hypothesis:
 def backlash(joint: int, place: str, damping_time: float) -> Hypothesis:
     """Dead band of width ``gap`` in the gear's deflection.
 
-    Within it the gear's damper acts as outside, or is ``loose`` as its spring is: a part of it, as a time constant of the spring.
+    Within it the gear's damper acts as outside, or is ``loose`` as its spring is: a part of it, as a time constant of
+    the spring.
 
     Args:
         damping_time: nominal damping of the gear over its stiffness, s; what is loose is no more.
@@ -49,16 +50,22 @@ def backlash(joint: int, place: str, damping_time: float) -> Hypothesis:
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         if not shape:
-            # A gear that always carries its load one way is through its dead band, however wide: the arm stands elsewhere.
+            # A gear that always carries its load one way is through its dead band, however wide: the arm stands
+            # elsewhere.
             delta = motion.delta(j)
             carried = -0.5 * k * np.sign(delta).mean(axis=1, keepdims=True)
-            return Screen((np.broadcast_to(carried, delta.shape),), lambda c: np.array([c[0], 0.0]) if c[0] > 0.0 else None, shape)
+            return Screen(
+                (np.broadcast_to(carried, delta.shape),), lambda c: np.array([c[0], 0.0]) if c[0] > 0.0 else None, shape
+            )
         delta = motion.delta(j)
         signal = -k * np.clip(delta, -0.5 * shape[0], 0.5 * shape[0])
-        # As long as the gear stays on its flanks the response grows with the gap; beyond, a linear step is not followed far.
+        # As long as the gear stays on its flanks the response grows with the gap; beyond, a linear step is not followed
+        # far.
         most = max(3.0 * shape[0], 2.0 * np.abs(delta).min())
         return Screen(
-            (signal,), lambda c: np.array([np.clip(c[0] * shape[0], 0.3 * shape[0], most), 0.0]) if c[0] > 0.1 else None, shape
+            (signal,),
+            lambda c: np.array([np.clip(c[0] * shape[0], 0.3 * shape[0], most), 0.0]) if c[0] > 0.1 else None,
+            shape,
         )
 
     return Hypothesis(
@@ -68,7 +75,9 @@ def backlash(joint: int, place: str, damping_time: float) -> Hypothesis:
         "spring",
         (
             Parameter("gap", "rad", 1e-9, 0.5, log=True, step=1e-2),
-            Parameter("loose", "s", 0.0, damping_time, nuisance=True, step=0.02 * damping_time, spread=damping_time, null=0.0),
+            Parameter(
+                "loose", "s", 0.0, damping_time, nuisance=True, step=0.02 * damping_time, spread=damping_time, null=0.0
+            ),
         ),
         lambda p, delta, k: kernels.Law(kernels.BACKLASH, p[0], k * p[1], k),
         lambda scale: [(), *((2 * f * scale.delta[2],) for f in (0.03, 0.1, 0.3, 1.0))],
@@ -102,7 +111,9 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         joint,
         "spring",
         (
-            Parameter("low_stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=0.8, per_stiffness=True),
+            Parameter(
+                "low_stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=0.8, per_stiffness=True
+            ),
             Parameter("transition", "rad", 1e-9, 1.0, log=True, step=1e-2),
         ),
         lambda p, delta, k: kernels.Law(kernels.SOFTENING, float(np.clip(p[0], SOFTEST * k, k)), p[1], k),
@@ -137,7 +148,9 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
             Parameter("stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=1.5, per_stiffness=True),
             Parameter("yield_torque", "N m", 1e-9, 1e7, log=True, step=1e-2),
             replace(EXPONENT, center=ROUNDED),
-            Parameter("recoil", "1", 0.0, 1.5, nuisance=True, step=0.05, center=0.0, spread=0.5, null=0.0, reported=True),
+            Parameter(
+                "recoil", "1", 0.0, 1.5, nuisance=True, step=0.05, center=0.0, spread=0.5, null=0.0, reported=True
+            ),
             START,
         ),
         lambda p, delta, k: kernels.Law(kernels.HYSTERESIS, p[0], p[1], k, *p[2:]),

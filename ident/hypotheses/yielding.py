@@ -1,9 +1,9 @@
 """Elements that yield: a spring up to a limit, and how it gets there.
 
-The torque ``h`` along a path ``x`` follows ``h' = k (1 - w^n) x'`` where the path drives it on and ``h' = k (1 + r w^n) x'``
-where it leads it back, ``w = |h| / limit``: a Bouc-Wen element (Wen, J. Eng. Mech. Div. ASCE 102, 1976, with
-``beta + gamma = 1``, ``beta - gamma = r >= 0``). It holds Dahl's bristle (``n = 1``, ``r = 1``; Dahl 1968) and, where ``n`` is
-large, the Maxwell slip; several slips of different limits in parallel are close to one of some ``n`` between.
+The torque ``h`` along a path ``x`` follows ``h' = k (1 - w^n) x'`` where the path drives it on and ``h' = k (1 + r w^n)
+x'`` where it leads it back, ``w = |h| / limit``: a Bouc-Wen element (Wen, J. Eng. Mech. Div. ASCE 102, 1976, with
+``beta + gamma = 1``, ``beta - gamma = r >= 0``). It holds Dahl's bristle (``n = 1``, ``r = 1``; Dahl 1968) and, where
+``n`` is large, the Maxwell slip; several slips of different limits in parallel are close to one of some ``n`` between.
 """
 
 from __future__ import annotations

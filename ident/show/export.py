@@ -57,7 +57,9 @@ def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
                 "place": cause.joint,
                 "probability": cause.probability,
                 **({"with_load": True} if cause.with_load else {}),
-                "parameters": {k: {"value": v.value, "std": v.std, "unit": v.unit} for k, v in cause.parameters.items()},
+                "parameters": {
+                    k: {"value": v.value, "std": v.std, "unit": v.unit} for k, v in cause.parameters.items()
+                },
             }
         )
     path.write_text(tomlkit.dumps(head), encoding="utf-8")
@@ -88,7 +90,8 @@ def build_mjcf(
     friction are exact under the time step and the integrator of the file.
 
     Args:
-        parameters: by the names of ``ident.graybox.parameter_names``, and ``link_friction.<joint>`` where links have some.
+        parameters: by the names of ``ident.graybox.parameter_names``, and ``link_friction.<joint>`` where links have
+            some.
         inertias: of bodies by joint of the description, instead of those of the description.
     """
     hinges = tuple(
@@ -151,9 +154,7 @@ def _add_bodies(spec: mujoco.MjSpec, model: pin.Model, springs: dict[str, Elasti
     for i in range(1, model.njoints):
         placement, inertia, name = model.jointPlacements[i], model.inertias[i], model.names[i]
         x, y, z, w = pin.Quaternion(placement.rotation).coeffs()
-        body = bodies[model.parents[i]].add_body(
-            name=f"body:{name}", pos=placement.translation, quat=[w, x, y, z]
-        )
+        body = bodies[model.parents[i]].add_body(name=f"body:{name}", pos=placement.translation, quat=[w, x, y, z])
         body.explicitinertial = True
         body.mass = max(float(inertia.mass), 1e-9)
         body.ipos = inertia.lever
@@ -191,7 +192,14 @@ def _add_bone(body: mujoco.MjsBody, end: np.ndarray) -> None:
 
 def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> None:
     rotor = spec.worldbody.add_body(name=f"rotor:{name}")
-    rotor.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.05, 0, 0], mass=ROTOR_MASS, contype=0, conaffinity=0, rgba=[0, 0, 0, 0])
+    rotor.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[0.05, 0, 0],
+        mass=ROTOR_MASS,
+        contype=0,
+        conaffinity=0,
+        rgba=[0, 0, 0, 0],
+    )
     rotor.add_joint(
         name=f"motor:{name}",
         axis=[0, 0, 1],
@@ -246,7 +254,8 @@ def _note_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
 
 
 def _couplings(robot: Robot, causes: Sequence[Cause]) -> dict[tuple[str, str], float]:
-    """(motor, joint that it turns too) -> ratio; a tendon takes a joint once. The next joint where a cause does not say which."""
+    """(motor, joint that it turns too) -> ratio; a tendon takes a joint once. The next joint where a cause does not say
+    which."""
     out: dict[tuple[str, str], float] = {}
     for c in causes:
         if c.effect == "joint_coupling":

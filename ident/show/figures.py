@@ -141,9 +141,7 @@ def frf_grid_figure(view: FrfView, joints: tuple[str, ...]) -> str:
     """Gain of all entries of one operating point: torque of the column, acceleration of the row."""
     n = len(joints)
     with mpl.rc_context(STYLE | {"xtick.labelsize": 5, "ytick.labelsize": 5}):
-        fig, axes = _subplots(
-            n, n, figsize=(11, 1.25 * n + 0.6), sharex=True, squeeze=False, layout="constrained"
-        )
+        fig, axes = _subplots(n, n, figsize=(11, 1.25 * n + 0.6), sharex=True, squeeze=False, layout="constrained")
         for i in range(n):
             for j in range(n):
                 _draw_response(axes[i][j], view, i, j)
@@ -190,7 +188,9 @@ def evidence_figure(plot: EvidencePlot) -> str:
     """Residual torque against the variable that explains it."""
     with mpl.rc_context(STYLE):
         fig, ax = _subplots(figsize=(5.2, 3.3), layout="constrained")
-        ax.plot(*_thin(plot.x, plot.y), ".", ms=2.2, mew=0, alpha=0.45, color=MEASURED, label="residual without the cause")
+        ax.plot(
+            *_thin(plot.x, plot.y), ".", ms=2.2, mew=0, alpha=0.45, color=MEASURED, label="residual without the cause"
+        )
         ax.plot(*_thin(plot.model_x, plot.model_y), ".", ms=2.2, mew=0, alpha=0.7, color=AFTER, label="fitted effect")
         ax.set_xlabel(plot.x_label)
         ax.set_ylabel(plot.y_label)
@@ -201,18 +201,23 @@ def evidence_figure(plot: EvidencePlot) -> str:
 def trace_figure(
     trace: TorqueTrace, joints: tuple[str, ...], units: tuple[str, ...], of_gain: Collection[str] = ()
 ) -> str:
-    """Torque errors of both models in time on one held-out segment, of three joints: those ``of_gain`` first, then the worst."""
+    """Torque errors of both models in time on one held-out segment, of three joints: those ``of_gain`` first, then the
+    worst."""
     before = (trace.measured - trace.before).std(axis=0)
     scale = np.maximum(trace.measured.std(axis=0), 1e-9)
     others = np.array([name not in of_gain for name in joints])
     worst = np.sort(np.lexsort((-before / scale, others))[: min(3, len(joints))])
     with mpl.rc_context(STYLE):
-        fig, axes = _subplots(len(worst), 1, figsize=(11, 1.4 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained")
+        fig, axes = _subplots(
+            len(worst), 1, figsize=(11, 1.4 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained"
+        )
         step = max(1, len(trace.t) // POINTS)
         for ax, j in zip(axes.flat, worst, strict=True):
             t = trace.t[::step]
             ax.plot(t, (trace.measured - trace.before)[::step, j], color=BEFORE, lw=0.7, label="error of the baseline")
-            ax.plot(t, (trace.measured - trace.after)[::step, j], color=AFTER, lw=0.7, label="error of the extended model")
+            ax.plot(
+                t, (trace.measured - trace.after)[::step, j], color=AFTER, lw=0.7, label="error of the extended model"
+            )
             ax.set_title(joints[j], fontsize=8, loc="left")
             ax.set_ylabel(units[j])
             ax.margins(x=0)

@@ -30,7 +30,9 @@ def check_recording(path: Path) -> None:
             file.seek(max(end, 0))
             whole = start == b"RRF2" and b"RRF2FOOT" in file.read()
     except OSError as err:
-        raise DataError("recording", str(path), str(err.strerror or err), "the recording.rrd of `simgap diagnose`") from err
+        raise DataError(
+            "recording", str(path), str(err.strerror or err), "the recording.rrd of `simgap diagnose`"
+        ) from err
     if not whole:
         raise DataError("recording", str(path), "no whole recording of rerun", "the recording.rrd of `simgap diagnose`")
 
@@ -55,10 +57,10 @@ def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     joints = _worst_joints(diagnosis)
     unit = units_of_torques(diagnosis.robot)
     torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, {unit[joints[0]]}")]
-    torques += [rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, {unit[name]}") for name in joints]
-    responses = [
-        rrb.Spatial2DView(origin="frf", name=f"FRF at {view.operating_point}") for view in diagnosis.frf[:1]
+    torques += [
+        rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, {unit[name]}") for name in joints
     ]
+    responses = [rrb.Spatial2DView(origin="frf", name=f"FRF at {view.operating_point}") for view in diagnosis.frf[:1]]
     left = rrb.Vertical(
         rrb.TextDocumentView(origin="verdict", name="verdict"),
         rrb.Spatial3DView(origin="arm", name="arm", eye_controls=_eye(diagnosis)),
@@ -104,7 +106,12 @@ def _markdown(diagnosis: Diagnosis) -> str:
     rows = [f"## {v.sentence}", ""]
     for c in v.causes:
         values = ", ".join(f"{k} = {rounded(x.value, x.std)}{unit_suffix(x.unit)}" for k, x in c.parameters.items())
-        rows += [f"**{c.effect.replace('_', ' ')} at {c.joint}**, probability {c.probability:.3f}: {values}", "", c.evidence, ""]
+        rows += [
+            f"**{c.effect.replace('_', ' ')} at {c.joint}**, probability {c.probability:.3f}: {values}",
+            "",
+            c.evidence,
+            "",
+        ]
     if v.gain is not None:
         g, unit = v.gain, torque_unit(diagnosis.robot, v.gain.joints)
         interval = "" if g.ci95 is None else f" (95 % interval {g.ci95[0]:.1%} to {g.ci95[1]:.1%} of the gap closed)"
@@ -183,7 +190,9 @@ def _log_meshes(stream: rr.RecordingStream, robot: Robot) -> bool:
         M = shape.placement
         stream.log(
             entity,
-            rr.Transform3D(translation=M.translation, quaternion=pin.Quaternion(M.rotation).coeffs(), scale=shape.meshScale),
+            rr.Transform3D(
+                translation=M.translation, quaternion=pin.Quaternion(M.rotation).coeffs(), scale=shape.meshScale
+            ),
             static=True,
         )
         stream.log(f"{entity}/mesh", rr.Asset3D(path=file, albedo_factor=[170, 180, 190, 255]), static=True)

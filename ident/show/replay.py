@@ -94,7 +94,12 @@ def load_arm(source: str | Path | mujoco.MjSpec, joints: Sequence[str], sample_t
     old = spec.option.timestep
     step = sample_time / np.ceil(sample_time / old - 1e-9)
     lead = stage_lead(old, spec.option.integrator) - stage_lead(step, spec.option.integrator)
-    delay, lag, gear, limit = np.zeros(len(joints)), np.zeros(len(joints)), np.ones(len(joints)), np.full(len(joints), np.inf)
+    delay, lag, gear, limit = (
+        np.zeros(len(joints)),
+        np.zeros(len(joints)),
+        np.ones(len(joints)),
+        np.full(len(joints), np.inf),
+    )
     for j, name in enumerate(joints):
         drive = spec.actuator(f"drive:{name}")
         gear[j] = drive.gear[0]
@@ -142,7 +147,11 @@ def replay(arm: Arm, group: Group, sampling: Sampling) -> Replay:
     s = 1j * group.omega[:, None]
     shift = np.exp(s * arm.timing)
     rest, hold = equilibrium(arm, group.posture)
-    Z = sampled_impedance(arm, rest, hold, group.omega, m) * np.exp(s * arm.delay)[:, :, None] * np.exp(s * arm.sensor_delay)[:, None, :]
+    Z = (
+        sampled_impedance(arm, rest, hold, group.omega, m)
+        * np.exp(s * arm.delay)[:, :, None]
+        * np.exp(s * arm.sensor_delay)[:, None, :]
+    )
     aim = group.Q * group.signal_share * np.exp(s * arm.sensor_delay)
     fed = group.U / shift
     fed[:, 0] -= arm.offset
@@ -220,7 +229,9 @@ def sampled_impedance(arm: Arm, rest: np.ndarray, hold: np.ndarray, omega: np.nd
 
     x = np.concatenate([rest, np.zeros(nv), hold[arm.lag > 0]])
     n, size = len(hold), len(x)
-    A1 = np.stack([(after(_moved(x, k, STEP), hold) - after(_moved(x, k, -STEP), hold)) / (2 * STEP) for k in range(size)], 1)
+    A1 = np.stack(
+        [(after(_moved(x, k, STEP), hold) - after(_moved(x, k, -STEP), hold)) / (2 * STEP) for k in range(size)], 1
+    )
     B1 = np.stack([(after(x, _moved(hold, k, 1.0)) - after(x, _moved(hold, k, -1.0))) / 2.0 for k in range(n)], 1)
     A, B = np.eye(size), np.zeros((size, n))
     for _ in range(substeps):

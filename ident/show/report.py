@@ -43,10 +43,14 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         response_unit=response_unit(robot),
         table=parameter_table(diagnosis.verdict.baseline),
         grid=[(view.operating_point, frf_grid_figure(view, joints)) for view in _worst(diagnosis.frf)[:1]],
-        frfs=[(view.operating_point, frf_figure(view, joints, response_unit(robot))) for view in diagnosis.frf[:MAX_FRFS]],
+        frfs=[
+            (view.operating_point, frf_figure(view, joints, response_unit(robot))) for view in diagnosis.frf[:MAX_FRFS]
+        ],
         where=where_figure(diagnosis.spectrum, joints, torque_unit(robot)) if diagnosis.spectrum else None,
         evidence={p.cause: evidence_figure(p) for p in diagnosis.evidence},
-        traces=[(t.segment, trace_figure(t, joints, torque_units(robot), of_gain)) for t in diagnosis.traces[:MAX_TRACES]],
+        traces=[
+            (t.segment, trace_figure(t, joints, torque_units(robot), of_gain)) for t in diagnosis.traces[:MAX_TRACES]
+        ],
     )
     path.write_text(html, encoding="utf-8")
 

@@ -67,7 +67,9 @@ def simulated_gain(
         progress("simulation of both models")
     errors = simulated_errors(problem, groups, baseline.model, export_baseline(baseline.model), model)
     rng = np.random.default_rng(SEED)
-    return measure_gain(errors, units_of_torques(problem.structure.robot), affected, "simulated in closed loop", rng, METRIC)
+    return measure_gain(
+        errors, units_of_torques(problem.structure.robot), affected, "simulated in closed loop", rng, METRIC
+    )
 
 
 def export_baseline(model: Model) -> mujoco.MjSpec:

@@ -7,8 +7,10 @@ import scipy.optimize
 
 from ident.hypotheses.yielding import SLIP, along_path, elastoplastic
 
-GIVES = np.geomspace(0.08, 4.0, 12)  # deflections at which slips yield, over that at which the element would if it were one
-SWINGS, POINTS, REACH = 12, 4800, 4.0  # of the path along which they are alike: it grows to this deflection and dies out
+# deflections at which slips yield, over that at which the element would if it were one
+GIVES = np.geomspace(0.08, 4.0, 12)
+# of the path along which they are alike: it grows to this deflection and dies out
+SWINGS, POINTS, REACH = 12, 4800, 4.0
 LEAST = 1e-3  # share of the torque below which a slip is left out
 
 

@@ -43,8 +43,29 @@ _CLASSES = (
 )
 PARALLEL = 0.9  # cosine from which on two axes are one
 VECTORS = ("com", "axis")
-DIVISORS = ("stribeck_velocity", "low_stiffness", "transition", "time_constant", "resolution", "yield_torque", "mass", "inertia")
-SIZES = ("torque", "coulomb", "static", "stiffness", "damping", "delay", "limit", "gap", "friction", "coefficient", "cubic")
+DIVISORS = (
+    "stribeck_velocity",
+    "low_stiffness",
+    "transition",
+    "time_constant",
+    "resolution",
+    "yield_torque",
+    "mass",
+    "inertia",
+)
+SIZES = (
+    "torque",
+    "coulomb",
+    "static",
+    "stiffness",
+    "damping",
+    "delay",
+    "limit",
+    "gap",
+    "friction",
+    "coefficient",
+    "cubic",
+)
 LEAST, LARGEST = 1e-12, 1e15  # sizes of parameters, SI
 LONGEST = 1.0  # s of a delay
 EFFECTS = {c.name: c for c in _CLASSES}
@@ -52,11 +73,7 @@ EFFECTS = {c.name: c for c in _CLASSES}
 
 def parameters_of(effect: object) -> dict[str, object]:
     """Parameters of an effect by their catalogue names."""
-    return {
-        f.name.rstrip("_"): getattr(effect, f.name)
-        for f in dataclasses.fields(effect)
-        if f.name != "place"
-    }
+    return {f.name.rstrip("_"): getattr(effect, f.name) for f in dataclasses.fields(effect) if f.name != "place"}
 
 
 def make_effect(name: str, place: str, **values: object) -> object:
@@ -205,7 +222,11 @@ def draw_effect(
         "joint_coupling": {"ratio": 0.1 * size},
         "payload": {"mass": 1.5 * size, "com_x": 0.02, "com_y": 0.0, "com_z": 0.08},
         "link_inertia": wrong_link,
-        "transverse_elasticity": {"stiffness": 0.7 * k / size, "damping": 6e-4 * k, "axis": tuple(float(v) for v in across)},
+        "transverse_elasticity": {
+            "stiffness": 0.7 * k / size,
+            "damping": 6e-4 * k,
+            "axis": tuple(float(v) for v in across),
+        },
         "base_elasticity": {"stiffness": 10 * k / size, "damping": 6e-3 * k, "axis": (1.0, 0.0, 0.0)},
         "gravity_spring": {"stiffness": 0.1 * joint.torque_limit * size, "rest_angle": float(rng.uniform(-1, 1))},
         "dress_pack": {"stiffness": 0.1 * joint.torque_limit * size, "friction": 0.3 * torque},

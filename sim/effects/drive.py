@@ -93,6 +93,4 @@ class Cogging:
 
     def torque(self, run: Run) -> Callable[[State], Torque]:
         j = run.joint(self.place)
-        return lambda x: Torque(
-            j, self.amplitude * np.sin(self.periods_per_rev * x.q[:, j] + self.phase)
-        )
+        return lambda x: Torque(j, self.amplitude * np.sin(self.periods_per_rev * x.q[:, j] + self.phase))

@@ -14,7 +14,8 @@ import numpy as np
 from sim.effects.effect import Dry, State
 
 REVERSAL = 1e-3  # rad/s, velocity over which a regularised sign turns
-MOTOR_SHARE = 0.75  # of the inertia that is counted on: with all of it a motor thrown into rest would ring from step to step
+# of the inertia that is counted on: with all of it a motor thrown into rest would ring from step to step
+MOTOR_SHARE = 0.75
 LINK_SHARE = 0.5  # the same of a link's at the start, which changes with the posture
 TURNS, TURNED = 20, 1e-6  # steps of Newton at most; step in multiples of ``REVERSAL`` that ends them
 
@@ -46,7 +47,10 @@ def resistance(
         motor_inertia, link_inertia: (S, n) what a torque there moves at the start, gears as springs, kg m2.
     """
     # Of the velocity half a step on, per torque.
-    change_of = {link: 0.5 * step / (REVERSAL * x) for link, x in ((False, MOTOR_SHARE * motor_inertia), (True, LINK_SHARE * link_inertia))}
+    change_of = {
+        link: 0.5 * step / (REVERSAL * x)
+        for link, x in ((False, MOTOR_SHARE * motor_inertia), (True, LINK_SHARE * link_inertia))
+    }
     before: dict[tuple[int, bool], np.ndarray] = {}
 
     def against(x: State) -> list[tuple[Dry, np.ndarray]]:
@@ -54,7 +58,9 @@ def resistance(
         for law in laws:
             new = law(x)
             old = total.get((new.joint, new.link), Dry(new.joint, 0.0, 0.0, new.link))
-            total[new.joint, new.link] = Dry(new.joint, old.forward + new.forward, old.backward + new.backward, new.link)
+            total[new.joint, new.link] = Dry(
+                new.joint, old.forward + new.forward, old.backward + new.backward, new.link
+            )
         out = []
         for key, dry in total.items():
             j = dry.joint

@@ -67,7 +67,8 @@ class Torque:
 
 @dataclass(frozen=True)
 class Dry:
-    """Dry friction of one joint: what it takes, each (S,) N m, to move forward and backward; at the motor or at the link."""
+    """Dry friction of one joint: what it takes, each (S,) N m, to move forward and backward; at the motor or at the
+    link."""
 
     joint: int
     forward: np.ndarray | float
@@ -81,8 +82,8 @@ GEAR_SPRINGS = "gear", "outer"  # tendons of a joint that carry torque from its 
 def carried(run: Run, place: str) -> Callable[..., np.ndarray]:
     """Torque (S,) that springs and damper of a joint's gear carry, laws in its tendons included, N m.
 
-    It is asked for a state, with more wind-up (S,), rad, and its rate, rad/s, where there is an error of the transmission.
-    An element that is a torque of its own, as that of a hysteresis, is beside them.
+    It is asked for a state, with more wind-up (S,), rad, and its rate, rad/s, where there is an error of the
+    transmission. An element that is a torque of its own, as that of a hysteresis, is beside them.
     """
     j, model = run.joint(place), run.model
     names = [model.tendon(i).name for i in range(model.ntendon)]

@@ -48,8 +48,13 @@ def write_dataset(folder: Path) -> Path:
     def segment(name: str, **kwargs) -> Segment:
         return Segment(name=name, role="identification", t=np.arange(N) / 1000.0, tau=x[0], q=x[1], **kwargs)
 
-    labels = dict(operating_point="op01", q0=np.zeros(1), period=32, periods=4, transient_periods=1, experiment=1, realization=1)
-    made = (segment("a", kind="multisine", amplitude=1.0, excited_lines=np.array([1, 3, 5]), **labels), segment("b", kind="trajectory"))
+    labels = dict(
+        operating_point="op01", q0=np.zeros(1), period=32, periods=4, transient_periods=1, experiment=1, realization=1
+    )
+    made = (
+        segment("a", kind="multisine", amplitude=1.0, excited_lines=np.array([1, 3, 5]), **labels),
+        segment("b", kind="trajectory"),
+    )
     save_dataset(Dataset("small", "twomass", robot, 1000.0, robot.joint_names, "zoh", None, None, None, made), folder)
     return folder
 
@@ -147,18 +152,29 @@ def datasets() -> Iterator[Case]:
 
             def over(folder: Path, template=template) -> list[str]:
                 (folder / "x").write_text("hello")
-                return [{"DATA": str(write_dataset(folder / "d")), "OUT": str(folder / "x")}.get(a, a) for a in template]
+                return [
+                    {"DATA": str(write_dataset(folder / "d")), "OUT": str(folder / "x")}.get(a, a) for a in template
+                ]
 
             def within(folder: Path, template=template) -> list[str]:
                 (folder / "x").write_text("hello")
-                return [{"DATA": str(write_dataset(folder / "d")), "OUT": str(folder / "x" / "y")}.get(a, a) for a in template]
+                return [
+                    {"DATA": str(write_dataset(folder / "d")), "OUT": str(folder / "x" / "y")}.get(a, a)
+                    for a in template
+                ]
 
             yield Case(f"{command} out that is a file", over, "x")
             yield Case(f"{command} out inside a file", within, "x")
 
 
 def results() -> Iterator[Case]:
-    contents = {"empty": b"", "text": b"hello", "zeros": bytes(4000), "bits": bytes(range(256)) * 9, "a header alone": b"RRF2\x00\x22\x00\x00"}
+    contents = {
+        "empty": b"",
+        "text": b"hello",
+        "zeros": bytes(4000),
+        "bits": bytes(range(256)) * 9,
+        "a header alone": b"RRF2\x00\x22\x00\x00",
+    }
     for name, data in contents.items():
 
         def make(folder: Path, data=data) -> list[str]:
@@ -184,7 +200,18 @@ def plan_text() -> str:
     import tempfile
 
     robot = load_robot("twomass")
-    plan = make_plan(robot, points=1, validation_points=0, levels=(1.0,), period=200, periods=2, transient_periods=1, sample_rate=1000.0, trajectory=True, band_hz=(5.0, 60.0))
+    plan = make_plan(
+        robot,
+        points=1,
+        validation_points=0,
+        levels=(1.0,),
+        period=200,
+        periods=2,
+        transient_periods=1,
+        sample_rate=1000.0,
+        trajectory=True,
+        band_hz=(5.0, 60.0),
+    )
     plan = replace(plan, trajectories=tuple(replace(m, q_ref=m.q_ref[:200]) for m in plan.trajectories))
     with tempfile.TemporaryDirectory() as folder:
         plan_to_toml(plan, Path(folder) / "plan.toml")
@@ -267,9 +294,17 @@ def plans() -> Iterator[Case]:
     yield Case("plan of a rate that no step divides", size("sample_rate", 777.7), "")
     yield Case("plan of a huge rate", size("sample_rate", 1e7), "")
     for name, text in {"empty": "", "bytes": bytes(range(256)), "cut": 400, "nested": "x = " + "[" * 9000}.items():
-        yield Case(f"plan {name}", lambda f, t=text: plan_args(f, plan_text()[:t] if isinstance(t, int) else t), "plan.toml")
-    yield Case("plan that is not there", lambda f: ["experiment", "twomass", "--plan", str(f / "no.toml"), "--out", str(f / "out")], "no.toml")
-    yield Case("plan that is a folder", lambda f: ["experiment", "twomass", "--plan", str(f), "--out", str(f / "out")], "")
+        yield Case(
+            f"plan {name}", lambda f, t=text: plan_args(f, plan_text()[:t] if isinstance(t, int) else t), "plan.toml"
+        )
+    yield Case(
+        "plan that is not there",
+        lambda f: ["experiment", "twomass", "--plan", str(f / "no.toml"), "--out", str(f / "out")],
+        "no.toml",
+    )
+    yield Case(
+        "plan that is a folder", lambda f: ["experiment", "twomass", "--plan", str(f), "--out", str(f / "out")], ""
+    )
     yield Case("plan for another robot", lambda f: ["experiment", "ur10", *plan_args(f, plan_text())[2:]], "plan.toml")
 
 
@@ -334,4 +369,6 @@ def options() -> Iterator[Case]:
 
         huge = any(a in ("1000000000", "1000000000000") for a in args)
         usage = not set(args) & {"--effect", "--seed", "--estimator", "--real"}
-        yield Case("options " + " ".join(args), make, "", alone=huge or (args[0] == "demo" and not usage and "-3" in args))
+        yield Case(
+            "options " + " ".join(args), make, "", alone=huge or (args[0] == "demo" and not usage and "-3" in args)
+        )

@@ -39,7 +39,15 @@ def cases() -> Iterator[Case]:
     yield from names()
 
 
-def log(id_: str, suffix: str, write, outcome: str = REFUSED, names: str | None = None, map_text: str | None = None, alone: bool = False) -> Case:
+def log(
+    id_: str,
+    suffix: str,
+    write,
+    outcome: str = REFUSED,
+    names: str | None = None,
+    map_text: str | None = None,
+    alone: bool = False,
+) -> Case:
     """A conversion of one log that ``write(path)`` makes."""
 
     def make(folder: Path) -> list[str]:
@@ -120,7 +128,12 @@ def spoilt() -> Iterator[Case]:
     for suffix in sound.TABLES:
         whole = {k: np.round(1000 * v).astype(int) for k, v in x.items() if k != "t"}
         yield log("whole numbers", suffix, lambda p, s=changed(**whole): sound.write_table(p, s), ACCEPTED)
-        yield log("zeros throughout", suffix, lambda p, s=changed(**dict.fromkeys(("u1", "u2", "x1", "x2"), np.zeros(n))): sound.write_table(p, s), ACCEPTED)
+        yield log(
+            "zeros throughout",
+            suffix,
+            lambda p, s=changed(**dict.fromkeys(("u1", "u2", "x1", "x2"), np.zeros(n))): sound.write_table(p, s),
+            ACCEPTED,
+        )
         if suffix != ".mat":
             empty = {k: v[:0] for k, v in x.items()}
             yield log("no rows", suffix, lambda p, s=empty: sound.write_table(p, s))
@@ -146,7 +159,9 @@ def tables() -> Iterator[Case]:
     yield table("one null", x1=pa.array([None, *([0.1] * (n - 1))]))
     yield table("a null type", x1=pa.nulls(n))
     yield table("dates", x1=pa.array(np.arange(n), pa.timestamp("ns")), outcome=EITHER)
-    yield table("dates as time", t=pa.array((sound.columns()["t"] * 1e9).astype(int), pa.timestamp("ns")), outcome=EITHER)
+    yield table(
+        "dates as time", t=pa.array((sound.columns()["t"] * 1e9).astype(int), pa.timestamp("ns")), outcome=EITHER
+    )
     yield table("truth values", x1=pa.array([True, False] * (n // 2)))
     yield table("half floats", x1=pa.array(np.zeros(n, np.float16)), outcome=ACCEPTED)
     yield table("words of a dictionary", x1=pa.array(["a", "b"] * (n // 2)).dictionary_encode())
@@ -172,7 +187,9 @@ def text_files() -> Iterator[Case]:
     yield text("only a header", head + "\n")
     yield text("no line end", head)
     yield text("a column twice", "\n".join([head + ",x1", *(r + ",0" for r in rows)]))
-    yield text("a column twice", "\n".join([txt.splitlines()[0] + " x1", *(r + " 0" for r in txt.splitlines()[1:])]), ".txt")
+    yield text(
+        "a column twice", "\n".join([txt.splitlines()[0] + " x1", *(r + " 0" for r in txt.splitlines()[1:])]), ".txt"
+    )
     yield text("ragged", "\n".join([head, *rows[:50], "1,2", *rows[50:]]))
     yield text("ragged", "\n".join([*txt.splitlines()[:50], "1 2", *txt.splitlines()[50:]]), ".txt")
     yield text("an empty cell", "\n".join([head, *rows[:50], rows[50].rsplit(",", 1)[0] + ",", *rows[51:]]))
@@ -308,7 +325,9 @@ def matlab_files() -> Iterator[Case]:
     yield log("groups without end", ".h5.mat", h5(deeply))
     yield log("a compound", ".h5.mat", h5(lambda f, p: f.create_dataset("x1", data=np.zeros(sound.N, [("a", float)]))))
     yield log("text", ".h5.mat", h5(lambda f, p: f.create_dataset("x1", data=[b"a"] * sound.N)))
-    yield log("lists of lengths", ".h5.mat", h5(lambda f, p: f.create_dataset("x1", (sound.N,), h5py.vlen_dtype(float))))
+    yield log(
+        "lists of lengths", ".h5.mat", h5(lambda f, p: f.create_dataset("x1", (sound.N,), h5py.vlen_dtype(float)))
+    )
     yield log("no data", ".h5.mat", h5(lambda f, p: f.create_dataset("x1", data=h5py.Empty("f8"))))
     yield log("a single number", ".h5.mat", h5(lambda f, p: f.create_dataset("x1", data=1.0)))
 
@@ -352,11 +371,21 @@ def bags() -> Iterator[Case]:
     loop = JOINT_STATE.replace("string[] name", "sensor_msgs/JointState inner\nstring[] name")
     yield log("a definition that holds itself", ".mcap", lambda p: _raw_mcap(p, loop))
     yield log("a definition of another kind", ".mcap", lambda p: _raw_mcap(p, "garbage \x00 here"))
-    yield log("a definition of endless arrays", ".mcap", lambda p: _raw_mcap(p, JOINT_STATE.replace("float64[] position", "float64[1000000000] position")))
+    yield log(
+        "a definition of endless arrays",
+        ".mcap",
+        lambda p: _raw_mcap(p, JOINT_STATE.replace("float64[] position", "float64[1000000000] position")),
+    )
     yield log("no definition", ".mcap", lambda p: _raw_mcap(p, ""))
     yield log("another encoding", ".mcap", lambda p: _raw_mcap(p, JOINT_STATE, encoding="protobuf"))
-    yield log("messages that are cut", ".mcap", lambda p: _raw_mcap(p, JOINT_STATE, data=b"\x00\x01\x00\x00" + b"\x01" * 9))
-    yield log("counts beyond the message", ".mcap", lambda p: _raw_mcap(p, JOINT_STATE, data=b"\x00\x01\x00\x00" + bytes(12) + b"\xff\xff\xff\x7f" * 4))
+    yield log(
+        "messages that are cut", ".mcap", lambda p: _raw_mcap(p, JOINT_STATE, data=b"\x00\x01\x00\x00" + b"\x01" * 9)
+    )
+    yield log(
+        "counts beyond the message",
+        ".mcap",
+        lambda p: _raw_mcap(p, JOINT_STATE, data=b"\x00\x01\x00\x00" + bytes(12) + b"\xff\xff\xff\x7f" * 4),
+    )
     for name, script in DATABASES.items():
         yield log(name, ".db3", lambda p, s=script: _database(p, s), alone="without end" in name or "blobs" in name)
 
@@ -422,7 +451,11 @@ def bombs() -> Iterator[Case]:
     def deflated(p: Path) -> None:
         scipy.io.savemat(p, {k: v for k, v in sound.columns().items() if k != "x1"})
         count = 2**31 - 2**20
-        head = struct.pack("<II", 14, count + 56) + struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, 1, count // 8)
+        head = (
+            struct.pack("<II", 14, count + 56)
+            + struct.pack("<IIII", 6, 8, 6, 0)
+            + struct.pack("<IIii", 5, 8, 1, count // 8)
+        )
         head += struct.pack("<HHI", 1, 2, 0x3178) + struct.pack("<II", 9, count)
         packer, body = zlib.compressobj(1), []
         body.append(packer.compress(head))
@@ -437,7 +470,11 @@ def bombs() -> Iterator[Case]:
 
     def dimensions(p: Path, kind: int) -> None:
         scipy.io.savemat(p, {k: v for k, v in sound.columns().items() if k != "x1"})
-        body = struct.pack("<IIII", 6, 8, kind, 0) + struct.pack("<IIii", 5, 8, 2**20, 2**10) + struct.pack("<HHI", 1, 2, 0x3178)
+        body = (
+            struct.pack("<IIII", 6, 8, kind, 0)
+            + struct.pack("<IIii", 5, 8, 2**20, 2**10)
+            + struct.pack("<HHI", 1, 2, 0x3178)
+        )
         body += struct.pack("<HHi", 5, 4, 32) + struct.pack("<II", 1, 32) + b"a".ljust(32, b"\0") if kind == 2 else b""
         with p.open("ab") as file:
             file.write(struct.pack("<II", 14, len(body)) + body)
@@ -483,7 +520,9 @@ def _packed_mcap(path: Path, method: str, size: int) -> None:
         parts = [packer.begin(), *(packer.compress(block) for _ in range(size // len(block))), packer.flush()]
         data = b"".join(parts)
     name = method.encode()
-    body = struct.pack("<QQQI", 0, 1, size, 0) + struct.pack("<I", len(name)) + name + struct.pack("<Q", len(data)) + data
+    body = (
+        struct.pack("<QQQI", 0, 1, size, 0) + struct.pack("<I", len(name)) + name + struct.pack("<Q", len(data)) + data
+    )
     header = struct.pack("<I", 0) * 2
     with path.open("wb") as file:
         file.write(b"\x89MCAP0\r\n" + b"\x01" + struct.pack("<Q", len(header)) + header)
@@ -501,7 +540,7 @@ NAMES = {  # name of the log -> whether it can be the name of a segment
     "\udcff\udcfe.csv": False,
     "...csv": True,
     "--out.csv": True,
-    "lo'g \"1\".csv": True,
+    'lo\'g "1".csv': True,
     "größe µ.csv": True,
     "dataset.toml.csv": True,
     "$(touch evil).csv": True,
@@ -516,7 +555,9 @@ def names() -> Iterator[Case]:
             args = sound.convert(folder)
             return [*args[:1], *args[1:], "--", str(folder / name)]
 
-        yield Case(f"name {k} of a log", make, "" if sound_name else "name of a segment", ACCEPTED if sound_name else REFUSED)
+        yield Case(
+            f"name {k} of a log", make, "" if sound_name else "name of a segment", ACCEPTED if sound_name else REFUSED
+        )
 
     def two(folder: Path) -> list[str]:
         for sub in ("m", "n"):

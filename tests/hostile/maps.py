@@ -54,7 +54,10 @@ KEYS: dict[tuple[str | int, ...], set[str]] = {
     ("multisine", "operating_point"): {"a text", "a long text", "a path", "control characters"},
     ("nonsense",): set(),
 }
-BARE = {"files": {"pos": "log.csv"}, "multisine": {"period": 100, "part": [{"first": 1, "last": 2}], "excited_lines": [3, 5]}}
+BARE = {
+    "files": {"pos": "log.csv"},
+    "multisine": {"period": 100, "part": [{"first": 1, "last": 2}], "excited_lines": [3, 5]},
+}
 
 
 def cases() -> Iterator[Case]:
@@ -99,10 +102,17 @@ def texts() -> Iterator[Case]:
     yield text("a key twice", good + good)
     yield text("nested without end", "x = " + "[" * 20000)
     yield text("a number of 10000 digits", "sample_rate = " + "9" * 10000 + good[19:])
-    yield text("a part without end", good + '[multisine]\nperiod = 100\n[[multisine.part]]\nfirst = 1\nlast = 9000000000000000\n', "log.csv")
-    yield text("a part backwards", good + '[multisine]\nperiod = 100\n[[multisine.part]]\nfirst = 2\nlast = 1\n')
-    yield text("lines beyond Nyquist", good + '[multisine]\nperiod = 100\nexcited_lines = [80]\n[[multisine.part]]\nfirst = 1\nlast = 2\n')
-    yield text("a short part", good + '[multisine]\nperiod = 5\n[[multisine.part]]\nfirst = 1\nlast = 1\n', "log.csv")
+    yield text(
+        "a part without end",
+        good + "[multisine]\nperiod = 100\n[[multisine.part]]\nfirst = 1\nlast = 9000000000000000\n",
+        "log.csv",
+    )
+    yield text("a part backwards", good + "[multisine]\nperiod = 100\n[[multisine.part]]\nfirst = 2\nlast = 1\n")
+    yield text(
+        "lines beyond Nyquist",
+        good + "[multisine]\nperiod = 100\nexcited_lines = [80]\n[[multisine.part]]\nfirst = 1\nlast = 2\n",
+    )
+    yield text("a short part", good + "[multisine]\nperiod = 5\n[[multisine.part]]\nfirst = 1\nlast = 1\n", "log.csv")
 
     def given(id_: str, *names: str, robot: str | None = None) -> Case:
         def make(folder: Path) -> list[str]:
@@ -127,6 +137,7 @@ def texts() -> Iterator[Case]:
     yield given("robot by a path with dots", robot="../../../../etc")
     yield given("robot that is a file", robot="map.toml")
     for value in ("sample_rate = 1e-3", "sample_rate = 1e7"):
+
         def odd(folder: Path, value=value) -> list[str]:
             (folder / "log.csv").write_bytes(sound.log_bytes(".csv"))
             return sound.convert(folder, "log.csv", map_text=sound.MAP.replace("sample_rate = 500.0", value))

@@ -10,7 +10,13 @@ from tests.hostile import sound
 from tests.hostile.case import ACCEPTED, REFUSED, Case
 
 URDF = sound.URDF
-LOL = '<!DOCTYPE robot [<!ENTITY a "' + "lol" * 100 + '">' + "".join(f'<!ENTITY {b} "{f"&{a};" * 20}">' for a, b in zip("abcdefgh", "bcdefghi")) + "]>"
+LOL = (
+    '<!DOCTYPE robot [<!ENTITY a "'
+    + "lol" * 100
+    + '">'
+    + "".join(f'<!ENTITY {b} "{f"&{a};" * 20}">' for a, b in zip("abcdefgh", "bcdefghi"))
+    + "]>"
+)
 
 
 def cases() -> Iterator[Case]:
@@ -54,11 +60,16 @@ def texts() -> dict[str, tuple[str | bytes, str]]:
         "a parent unknown": replaced('<parent link="b"/>', '<parent link="z"/>'),
         "a joint to itself": replaced('<parent link="b"/><child link="c"/>', '<parent link="c"/><child link="c"/>'),
         "a loop": replaced('<parent link="a"/>', '<parent link="c"/>'),
-        "a loop beside the tree": replaced('<parent link="b"/><child link="c"/>', '<parent link="d"/><child link="c"/>').replace(
-            "</robot>", '<link name="d"/><joint name="x" type="fixed"><parent link="c"/><child link="d"/></joint></robot>'
+        "a loop beside the tree": replaced(
+            '<parent link="b"/><child link="c"/>', '<parent link="d"/><child link="c"/>'
+        ).replace(
+            "</robot>",
+            '<link name="d"/><joint name="x" type="fixed"><parent link="c"/><child link="d"/></joint></robot>',
         ),
         "two roots": replaced('<link name="a"/>', '<link name="a"/><link name="free"/>'),
-        "two parents": URDF.replace("</robot>", '<joint name="x" type="fixed"><parent link="a"/><child link="c"/></joint></robot>'),
+        "two parents": URDF.replace(
+            "</robot>", '<joint name="x" type="fixed"><parent link="a"/><child link="c"/></joint></robot>'
+        ),
         "a link twice": replaced('<link name="a"/>', '<link name="a"/><link name="a"/>'),
         "a joint twice": replaced('name="two"', 'name="one"'),
         "a joint without a name": replaced('name="two" ', ""),
@@ -86,8 +97,11 @@ def texts() -> dict[str, tuple[str | bytes, str]]:
         "limits of NaN": replaced('lower="-3"', 'lower="nan"'),
         "limits without end": replaced('lower="-3" upper="3"', 'lower="-1e300" upper="1e300"'),
         "entities": LOL + replaced('name="pair"', 'name="&i;"'),
-        "entities in UTF-16": ('<?xml version="1.0" encoding="UTF-16"?>' + LOL + replaced('name="pair"', 'name="&i;"')).encode("utf-16"),
-        "an entity from a file": '<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]>' + URDF.replace("</robot>", "&x;</robot>"),
+        "entities in UTF-16": (
+            '<?xml version="1.0" encoding="UTF-16"?>' + LOL + replaced('name="pair"', 'name="&i;"')
+        ).encode("utf-16"),
+        "an entity from a file": '<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]>'
+        + URDF.replace("</robot>", "&x;</robot>"),
         "a DTD from a file": '<!DOCTYPE robot SYSTEM "file:///etc/passwd">' + URDF,
         "an unknown entity": URDF.replace("</robot>", "&nope;</robot>"),
         "an encoding that is none": '<?xml version="1.0" encoding="latin-99"?>' + URDF,
@@ -105,7 +119,10 @@ def texts() -> dict[str, tuple[str | bytes, str]]:
         "no axis": re.sub(r"<axis [^>]*>", "", URDF),
         "no inertial at all": re.sub(r"<inertial>.*?</inertial>", "", URDF, flags=re.S),
         "efforts of words": URDF.replace('effort="80"', 'effort="strong"'),
-        "a mesh with dots": URDF.replace('<link name="a"/>', '<link name="a"><visual><geometry><mesh filename="../../../etc/passwd"/></geometry></visual></link>'),
+        "a mesh with dots": URDF.replace(
+            '<link name="a"/>',
+            '<link name="a"><visual><geometry><mesh filename="../../../etc/passwd"/></geometry></visual></link>',
+        ),
         "names in other letters": URDF.replace('"one"', '"jöint µ 1"'),
         "90 joints": chain(90),
         "a name with quotes": replaced('name="one"', "name='o\"n]e'"),
@@ -121,7 +138,13 @@ def urdfs() -> Iterator[Case]:
             return ["robot", str(folder / "arm.urdf"), "--out", str(folder / "out")]
 
         yield Case(f"URDF {name}", make, "arm.urdf", outcome)
-    for name, outcome in {"a\nb.urdf": REFUSED, "\udcff.urdf": REFUSED, "...": ACCEPTED, "größe.urdf": ACCEPTED, "robot.toml": REFUSED}.items():
+    for name, outcome in {
+        "a\nb.urdf": REFUSED,
+        "\udcff.urdf": REFUSED,
+        "...": ACCEPTED,
+        "größe.urdf": ACCEPTED,
+        "robot.toml": REFUSED,
+    }.items():
 
         def named(folder: Path, name=name) -> list[str]:
             (folder / name).write_text(URDF)

@@ -113,7 +113,9 @@ def write_db3(path: Path, rows: list[tuple[int, dict]]) -> None:
         db.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
         db.execute("INSERT INTO topics VALUES (1, '/joint_states', 'sensor_msgs/msg/JointState', 'cdr')")
         for _, _, message in make_reader(file).iter_messages():
-            db.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (message.log_time, message.data))
+            db.execute(
+                "INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (message.log_time, message.data)
+            )
     db.close()
 
 
@@ -163,4 +165,14 @@ def convert(folder: Path, *logs: str | Path, map_text: str = MAP) -> list[str]:
     put_robot(folder)
     (folder / "map.toml").write_text(map_text, encoding="utf-8", errors="surrogateescape")
     files = [str(folder / x) for x in logs]
-    return ["convert", *files, "--robot", str(folder / "pair"), "--map", str(folder / "map.toml"), "--out", str(folder / "out"), "--quiet"]
+    return [
+        "convert",
+        *files,
+        "--robot",
+        str(folder / "pair"),
+        "--map",
+        str(folder / "map.toml"),
+        "--out",
+        str(folder / "out"),
+        "--quiet",
+    ]
