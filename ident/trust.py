@@ -178,13 +178,20 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
         if o.effect == "gravity_spring" and element(h) == "friction":
             continue  # what the law of a spring lacks follows the position, and stores what it takes
         least = SHADOW
-        if element(o) is not None and element(o) == element(h):
+        if element(o) is not None and element(o) == element(h) and not explained_by_time(found):
             least = SHADOW_OF_LAW
         if overtone(found, other):
             least = HARMONIC
         if fall(found) < least * fall(other):
             return True
     return False
+
+
+def explained_by_time(found: Round) -> bool:
+    """Whether a cause that drifts explains its joint down to the noise: what a law lacks at all times does not look so."""
+    winner = found.candidates[0]
+    j = winner.hypothesis.joint
+    return winner.hypothesis.variable == "time" and winner.fit.costs[j] <= DETECTION_EXCESS * winner.fit.counts[j]
 
 
 def overtone(found: Round, other: Round) -> bool:

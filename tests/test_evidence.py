@@ -241,6 +241,22 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
 
 
 @pytest.mark.parametrize(
+    ("second", "left", "expected"),
+    [("friction_drift", 1.05, False), ("friction_drift", 1.5, True), ("coulomb_friction", 1.05, True)],
+)
+def test_a_weak_drift_of_friction_beside_another_law_is_none_of_its_errors_where_nothing_is_left(
+    named, second, left, expected
+):
+    def round_of(h, before, after):
+        fits = [SimpleNamespace(costs=np.full(6, x), counts=np.full(6, 1000.0)) for x in (before, after)]
+        return Round(fits[0], (Candidate(h, fits[1], 0.0),), (), 1.0, 1.0)
+
+    by_load = round_of(named["load_dependent_friction", "elbow_joint"], 1e5, 1000.0 * left + 2000.0)
+    weak = round_of(named[second, "elbow_joint"], 1000.0 * left + 2000.0, 1000.0 * left)
+    assert shadowed(weak, (by_load, weak)) is expected
+
+
+@pytest.mark.parametrize(
     ("periods", "left", "expected"), [(3770.0, 95.0, True), (3770.0, 0.0, False), (3000.0, 95.0, False)]
 )
 def test_a_weak_ripple_at_a_multiple_of_the_periods_of_another_is_its_overtone(named, periods, left, expected):
