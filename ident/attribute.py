@@ -99,8 +99,7 @@ def attribute(
         workers: where candidates are fitted.
     """
     if hypotheses is None:
-        # In motions alone offsets of the torque are found with the inertias of the links, as part of the baseline.
-        hypotheses = catalogue(problem.structure, offsets=not problem.motions_alone)
+        hypotheses = catalogue(problem.structure, motions_alone=problem.motions_alone)
     every = hypotheses = tuple(hypotheses)
     p_value = p_detected = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL

@@ -196,7 +196,7 @@ def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
     there = {e.hypothesis.key for e in current.model.effects}
     laws = [
         x
-        for x in catalogue(problem.structure)
+        for x in catalogue(problem.structure, motions_alone=problem.motions_alone)
         if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options and x.key not in there
     ]
     if not laws:

@@ -15,7 +15,6 @@ LEAST_DAMPING = 1e-6  # s, of a gear, over its stiffness
 PER_JOINT = (
     friction.coulomb_friction,
     friction.stribeck_friction,
-    friction.presliding_friction,
     friction.load_dependent_friction,
     friction.friction_drift,
     drive.cogging,
@@ -34,14 +33,15 @@ PER_JOINT = (
 )
 
 
-def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ...]:
+def catalogue(chain: Structure, *, motions_alone: bool = False) -> tuple[Hypothesis, ...]:
     """Every hypothesis at every place of an arm, decoys included.
 
     Decoys describe what the catalogue lacks: one that explains the data better than every named
     effect says that the cause is unknown.
 
     Args:
-        offsets: whether constant errors of the recorded torque are among them.
+        motions_alone: of records without multisines. Constant errors of the torque are part of the baseline there, and
+            the bristles of a friction are not damped.
     """
     robot = chain.robot
     names = robot.joint_names
@@ -50,6 +50,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
     for j, name in enumerate(names):
         out.append(drive.torque_saturation(j, name, wound_up=True))
         out += [make(j, name) for make in PER_JOINT]
+        out.append(friction.presliding_friction(j, name, damped=not motions_alone))
         if not linear[j]:  # what errs once a turn
             out.append(sensing.encoder_eccentricity(j, name))
         out.append(
@@ -61,7 +62,7 @@ def catalogue(chain: Structure, *, offsets: bool = True) -> tuple[Hypothesis, ..
         out.append(friction.position_friction(j, name))
         out.append(structure.link_friction(j, name))
         out += [drifts.torque_drift(j, name), drive.torque_ripple(j, name)]
-        if offsets:
+        if not motions_alone:
             out.append(sensing.constant_torque(j, name))
         if robot.joints[j].gear_ratio != 1.0:
             out.append(sensing.encoder_eccentricity(j, name, robot.joints[j].gear_ratio))

@@ -225,16 +225,23 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
     )
 
 
-def presliding_friction(joint: int, place: str) -> Hypothesis:
+def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothesis:
     """Spring of ``stiffness`` before it slips at ``coulomb``: Dahl's bristle, or a sharper one (see ``yielding``).
 
     Its bending is damped by ``relaxation`` times the stiffness, as in the LuGre model, whose ``sigma_1`` this is
     (Canudas de Wit, Olsson, Astrom and Lischinsky, IEEE Trans. Automatic Control 40, 1995).
+
+    Args:
+        damped: whether that damping is sought. Motions below the modes of the links do not show it.
     """
+    relaxation = (RELAXATION,) if damped else ()
+    undamped = [0.0] * len(relaxation)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         start = held_at_start(motion, j, p[1])
         z = bristle(motion.v(j), motion.time_step, p[1] / p[0], p[2], start)
+        if not damped:
+            return p[1] * z
         rate = (np.roll(z, -1, axis=1) - np.roll(z, 1, axis=1)) / (2.0 * motion.time_step)
         if start is not None:  # what it holds then was not bent in one step
             rate[:, [0, -1]] = 0.0
@@ -242,7 +249,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         z = bristle(motion.v(j), motion.time_step, shape[0])
-        return Screen((z,), lambda c: np.array([c[0] / shape[0], c[0], DAHL, 0.0]) if c[0] > 0 else None, shape)
+        return Screen((z,), lambda c: np.array([c[0] / shape[0], c[0], DAHL, *undamped]) if c[0] > 0 else None, shape)
 
     return Hypothesis(
         "presliding_friction",
@@ -253,7 +260,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             Parameter("stiffness", "N m/rad", 1e-6, 1e12, log=True, step=1e-2),
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True),
             replace(EXPONENT, center=DAHL, null=DAHL),
-            RELAXATION,
+            *relaxation,
         ),
         law,
         lambda scale: [(f * max(scale.q, LEAST_MOTION),) for f in (0.01, 0.03, 0.1, 0.3, 1.0)],
@@ -270,7 +277,7 @@ def presliding_friction(joint: int, place: str) -> Hypothesis:
             "trivial": lambda p, k: p[1] > MOST_GIVE * p[0],
             "special": lambda p: np.array([p[1], 0.0, SHARP]),
             "widens": lambda p, s: [
-                np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL, 0.0]) for f in (0.02, 0.2)
+                np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL, *undamped]) for f in (0.02, 0.2)
             ],
         },
     )
