@@ -20,7 +20,14 @@ from ident.graybox import Parameters
 from ident.group import Group
 from ident.held_out import not_fitted, with_held_out
 from ident.hypotheses.sensing import torque_offset
-from ident.identification import RUNAWAY, Setup, identify, set_up, under_noise_beside_causes
+from ident.identification import (
+    RUNAWAY,
+    Setup,
+    identify,
+    set_up,
+    under_noise_beside_causes,
+    with_noise_of_fast_lines,
+)
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
 from ident.next_experiment import separating_experiment
@@ -221,10 +228,15 @@ def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:
 def sought(
     dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
 ) -> tuple[Setup, Fit, Attribution]:
-    """Causes of what the baseline leaves, and more of them where beside these the noise turns out to be far less than
-    was guessed."""
+    """Causes of what the baseline leaves; once more where beside these the noise turns out to be far more or far less
+    than was guessed."""
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     try:
+        louder = with_noise_of_fast_lines(dataset, setup.problem, result.final)
+        if louder is not setup.problem and not workers.late:
+            workers.say("more noise")
+            setup, baseline = replace(setup, problem=louder), fit_baseline(louder, workers.say)
+            return setup, baseline, attribute(louder, baseline, max_causes=max_causes, workers=workers)
         other, first = under_noise_beside_causes(dataset, setup, result.final)
     except NOT_COMPUTED:
         return setup, baseline, result

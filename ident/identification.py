@@ -15,7 +15,7 @@ from ident.extended import Prediction
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from ident.group import Group
 from ident.inverse import Sampling
-from ident.noise import DOUBT, drifting, sample_noise, torque_noise_left, unexcited_noise, white_covariance
+from ident.noise import DOUBT, QUIET, drifting, sample_noise, torque_noise_left, unexcited_noise, white_covariance
 from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps, with_rounding
@@ -32,6 +32,7 @@ POSTURES = 8  # of a motion at which modes are looked at
 LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 RENEWALS = 3  # at most, of such noise
 LOUD = 2.0  # power of noise as it was guessed, over that which is found, from which it is lowered
+SLOW_LINES = 2.0  # power left at all lines of motions over that at the fast ones, up to which both are noise
 RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
 
 
@@ -275,6 +276,17 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
     """
     if not guessed_noise(dataset)[1] or any(g.shows_noise for g in problem.groups):
         return problem
+    left, shares = left_at_lines(problem, result)
+    power = DOUBT * torque_noise_left(left, shares)
+    if np.all(LOUD * power > 1.0):
+        return problem
+    lowered = np.maximum(problem.tau_std * np.sqrt(power), least_noise(dataset, "tau"))
+    return replace(problem, tau_std=np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(lowered, problem.tau_std)))
+
+
+def left_at_lines(problem: Problem, result: Fit) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """What a fit leaves, (S, K, n) by group, each joint of unit mean power for noise as assumed; (K, n) share of the
+    torque in that noise."""
     n, left, shares = problem.structure.n, [], []
     found = predictions(problem, result.model, result.remainders)
     for i, (group, pred) in enumerate(zip(problem.groups, found, strict=True)):
@@ -289,11 +301,29 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
         axis=0
     )
     unit = np.sqrt(result.costs / result.counts / np.maximum(mean, 1e-300))
-    power = DOUBT * torque_noise_left([X * unit for X in left], shares)
-    if np.all(LOUD * power > 1.0):
+    return [X * unit for X in left], shares
+
+
+def with_noise_of_fast_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
+    """Noise of the torque in motions that was guessed, raised to what a fit leaves in the upper half of the compared
+    band, where it leaves hardly more below.
+
+    Noise of which neighbouring samples go together is more there than their differences say, at most joints. What a
+    model lacks follows the motion, and shows most at the slow lines of it, at some joint.
+    """
+    n = problem.structure.n
+    if not problem.motions_alone or not guessed_noise(dataset)[1] or n == 1:  # a single joint has no others beside it
         return problem
-    lowered = np.maximum(problem.tau_std * np.sqrt(power), least_noise(dataset, "tau"))
-    return replace(problem, tau_std=np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(lowered, problem.tau_std)))
+    left, shares = left_at_lines(problem, result)
+    fast, share = (
+        np.concatenate([X[..., X.shape[-2] // 2 :, :].reshape(-1, n) for X in part]) for part in (left, shares)
+    )
+    power = np.quantile(np.abs(fast) ** 2, QUIET, axis=0) / -np.log(1.0 - QUIET)
+    if np.any(result.costs > SLOW_LINES * power * result.counts) or np.sum(power > LOUD) <= n / 2:
+        return problem
+    share = share.mean(axis=0)
+    torque = np.maximum((power - (1.0 - share)) / share, 1.0)
+    return replace(problem, tau_std=problem.tau_std * np.sqrt(torque))
 
 
 def with_known_noise(problem: Problem) -> Problem:

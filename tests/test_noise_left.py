@@ -5,10 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from ident.baseline import fit_baseline
 from ident.diagnosis import diagnose
-from ident.identification import identify, set_up, under_noise_beside_causes, with_noise_that_is_left
+from ident.identification import (
+    identify,
+    set_up,
+    under_noise_beside_causes,
+    with_noise_of_fast_lines,
+    with_noise_that_is_left,
+)
 from ident.noise import DOUBT, torque_noise_left
 from ident.problem import predictions
 from ident.refits import reweighted
@@ -130,3 +137,28 @@ def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tm
     if not coloured:
         own = make_weights(other.problem, predictions(other.problem, first.model, first.remainders), 0.0)
         assert reweighted(other.problem, first, own).costs == pytest.approx(first.costs, rel=0.02)
+
+
+@pytest.mark.parametrize("joints", [slice(None), slice(2, 3)])
+def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(ur10, tmp_path, joints):
+    """Of all joints alike it is seen at the fast lines of motions. At one joint alone it may as well be a cause."""
+    plan = small_plan(ur10, 32, points=1, trajectory=True)
+    (motion,) = plan.trajectories
+    data = run_experiment(replace(plan, experiments=(), trajectories=(motion,)), seed=32)
+    data = replace(through_files(data, tmp_path), q_std=None, tau_std=None)
+    (segment,) = data.segments
+    steps = np.random.default_rng(5).normal(size=segment.tau.shape) * 20.0 * ur10.array("tau_std")
+    coloured = scipy.signal.lfilter([1.0], [1.0, -0.9], steps, axis=0) * np.sqrt(1.0 - 0.9**2)
+    tau = segment.tau.copy()
+    tau[:, joints] += coloured[:, joints]
+    noisy = replace(segment, name="m1", role="identification", tau=tau)
+    held_out = replace(noisy, name="m2", role="validation")
+    data = replace(data, segments=(noisy, held_out))
+    setup, first = identify(data)
+    louder = with_noise_of_fast_lines(data, setup.problem, first)
+    assert first.chi2_per_dof > 1.5
+    if joints == slice(2, 3):
+        assert louder is setup.problem
+        return
+    assert np.all(louder.tau_std > setup.problem.tau_std)
+    assert not diagnose(data).discrepancy.detected
