@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 from ident.baseline import fit_baseline
-from ident.diagnosis import diagnose
+from ident.diagnosis import diagnose, sought
 from ident.identification import (
     identify,
     set_up,
@@ -17,6 +17,7 @@ from ident.identification import (
     with_noise_that_is_left,
 )
 from ident.noise import DOUBT, torque_noise_left
+from ident.parallel import Workers
 from ident.problem import predictions
 from ident.refits import reweighted
 from ident.weights import make_weights
@@ -161,4 +162,5 @@ def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(ur10, tmp_p
         assert louder is setup.problem
         return
     assert np.all(louder.tau_std > setup.problem.tau_std)
-    assert not diagnose(data).discrepancy.detected
+    _, _, result = sought(data, setup, first, 0, Workers())
+    assert not result.detected
