@@ -15,7 +15,15 @@ from ident.extended import Prediction
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from ident.group import Group
 from ident.inverse import Sampling
-from ident.noise import DOUBT, QUIET, drifting, sample_noise, torque_noise_left, unexcited_noise, white_covariance
+from ident.noise import (
+    DOUBT,
+    drifting,
+    power_at_fast_lines,
+    sample_noise,
+    torque_noise_left,
+    unexcited_noise,
+    white_covariance,
+)
 from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps, with_rounding
@@ -314,16 +322,10 @@ def with_noise_of_fast_lines(dataset: Dataset, problem: Problem, result: Fit) ->
     n = problem.structure.n
     if not problem.motions_alone or not guessed_noise(dataset)[1] or n == 1:  # a single joint has no others beside it
         return problem
-    left, shares = left_at_lines(problem, result)
-    fast, share = (
-        np.concatenate([X[..., X.shape[-2] // 2 :, :].reshape(-1, n) for X in part]) for part in (left, shares)
-    )
-    power = np.quantile(np.abs(fast) ** 2, QUIET, axis=0) / -np.log(1.0 - QUIET)
-    if np.any(result.costs > SLOW_LINES * power * result.counts) or np.sum(power > LOUD) <= n / 2:
+    whole, torque = power_at_fast_lines(*left_at_lines(problem, result))
+    if np.any(result.costs > SLOW_LINES * whole * result.counts) or np.sum(whole > LOUD) <= n / 2:
         return problem
-    share = share.mean(axis=0)
-    torque = np.maximum((power - (1.0 - share)) / share, 1.0)
-    return replace(problem, tau_std=problem.tau_std * np.sqrt(torque))
+    return replace(problem, tau_std=problem.tau_std * np.sqrt(np.maximum(torque, 1.0)))
 
 
 def with_known_noise(problem: Problem) -> Problem:

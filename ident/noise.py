@@ -278,6 +278,23 @@ def power_of_noise(power: np.ndarray, share: np.ndarray) -> np.ndarray:
     return high
 
 
+def power_at_fast_lines(left: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Power of noise in the upper half of the lines, and that of the torque in it, over those assumed; (n,) each.
+
+    As in ``torque_noise_left`` a quantile tells it, but it may be more than was assumed.
+
+    Args:
+        left, shares: as there.
+    """
+    n = shares[0].shape[1]
+    fast, share = (
+        np.concatenate([X[..., X.shape[-2] // 2 :, :].reshape(-1, n) for X in part]) for part in (left, shares)
+    )
+    power = np.quantile(np.abs(fast) ** 2, QUIET, axis=0) / -np.log(1.0 - QUIET)
+    share = share.mean(axis=0)
+    return power, (power - (1.0 - share)) / share
+
+
 def line_coherence(periods: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Coherence of what differs between periods from each line to the next.
 
