@@ -24,6 +24,7 @@ from ident.refits import (
     polish,
     refit,
     settled,
+    to_compete,
 )
 from ident.rounds import Round, outdone, temper_of
 from ident.screening import screen, signal_scale
@@ -87,9 +88,11 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     rivals += [*as_load(current, own, others), *elsewhere(problem, current, own, others)]
     rivals += wider(problem, current, own) if nearly_settled(current) else []
 
+    enough = to_compete(current.cost, current.count)
+
     def entered(effect: Effect) -> Fit | None:
         model = replace(current.model, effects=(*others, effect))
-        return refit(problem, model, current.weights, current.remainders)
+        return refit(problem, model, current.weights, current.remainders, aim=enough)
 
     def finished(entrant: Candidate) -> Candidate:
         last = entrant.fit

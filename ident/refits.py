@@ -23,6 +23,7 @@ FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the record leaves no more than noise
 REVIVED = 0.1  # of the nominal value, to which collapsed dampers are set before a fit
+DECISIVE = 30.0  # difference of the costs of two candidates of which one leaves noise alone, that settles it
 POLISH_STEPS = 40  # of the winner of a round
 
 
@@ -82,10 +83,12 @@ def refit(
     remainders: Sequence[np.ndarray],
     iterations: int = 10,
     most: float = np.inf,
+    aim: float = np.inf,
 ) -> Fit | None:
     """A candidate fitted from where screening put it; under the noise that it sees at the start where ``weights`` are
     None.
 
+    One that creeps short of the cost ``aim`` is left there.
     None where its model cannot be computed, costs more than ``most`` at the start, or ends where the data feel no
     change of its last effect, if it has any.
     """
@@ -98,6 +101,7 @@ def refit(
                 weights=weights,
                 remainders=remainders,
                 most=most,
+                aim=aim,
             )
     except NOT_COMPUTED:
         return None
@@ -105,6 +109,12 @@ def refit(
         return result
     felt = np.diag(result.information)[-len(result.model.effects[-1].p) :]
     return result if np.any(felt > 0.0) else None
+
+
+def to_compete(best: float, count: int) -> float:
+    """Cost up to which a candidate competes with the best one, of cost ``best`` over ``count`` data: the ``aim`` of its
+    fit."""
+    return best + max(DECISIVE, best - count)
 
 
 def either_turn(problem: Problem, result: Fit, effect: Effect, iterations: int = 10) -> Fit:

@@ -22,7 +22,18 @@ from ident.hypotheses import Hypothesis
 from ident.model import Model, has_loop, is_along_record
 from ident.parallel import Workers
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
-from ident.refits import FAINT, FINALISTS, FIRST_STEPS, either_turn, extended_by, left_by, refit, reweighted, turned
+from ident.refits import (
+    FAINT,
+    FINALISTS,
+    FIRST_STEPS,
+    either_turn,
+    extended_by,
+    left_by,
+    refit,
+    reweighted,
+    to_compete,
+    turned,
+)
 from ident.screening import Score, screen, signal_scale
 from ident.torque_fit import ANNEALING, Fit, anneal
 from ident.weights import make_weights
@@ -140,8 +151,11 @@ def under_noise_of_best(
     top = ranked[0][1]
     weights = make_weights(problem, predictions(problem, top.model, top.remainders), 0.0)
 
+    enough = to_compete(reweighted(problem, top, weights).cost, top.count)
+
     def moved(pair: tuple[Hypothesis, Fit]) -> Fit | None:
-        return None if is_along_record(pair[0]) else refit(problem, pair[1].model, weights, pair[1].remainders)
+        h, result = pair
+        return None if is_along_record(h) else refit(problem, result.model, weights, result.remainders, aim=enough)
 
     near = sum(r.cost - r.count <= NEAR * max(top.cost - top.count, 0.0) for _, r in ranked)
     last = min(max(near, FINALISTS), HOPEFUL)
@@ -177,6 +191,7 @@ def explore(
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
     answered = bool(scores) and scores[0].gain >= least * excess
+    noise = DETECTION_EXCESS * stage.count
 
     def started(score: Score) -> Fit | None:
         fits = [started_at(s) for s in (score, *score.near)]
@@ -190,16 +205,19 @@ def explore(
         most = np.inf if anywhere else STRONG * (stage.count if stage.chi2_per_dof <= FAINT else stage.cost)
         model, cost = begin(problem, stage, score)
         result = (
-            refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most)
+            refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most, noise)
             if anywhere or cost <= most
             else None
         )
         if result is not None and turned(result.model.effects[-1]) is not result.model.effects[-1]:
+            # On its way to another axis it creeps.
             return refit(problem, result.model, stage.weights, stage.remainders, FIRST_STEPS) or result
         return result
 
     def finished(result: Fit) -> Fit:
-        last = result if result.converged else refit(problem, result.model, stage.weights, result.remainders) or result
+        last = result
+        if not result.converged:
+            last = refit(problem, result.model, stage.weights, result.remainders, aim=enough) or result
         return either_turn(problem, last, last.model.effects[-1])
 
     def begun(chosen: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
@@ -222,6 +240,7 @@ def explore(
     found = hopeful(found)
     hardly = left_by(found) > (1.0 - HARDLY) * excess
     if not hardly and not (rough and left_by(found) < ANSWERED * excess):
+        enough = to_compete(min(r.cost for _, r in found), stage.count)
         last = workers.map(finished, [r for _, r in found])
         found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores

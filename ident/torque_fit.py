@@ -46,6 +46,7 @@ RIDGE = 1e-12  # relative, of a covariance
 LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
 SHORTER = 64.0  # factor on the damping of steps then
 SLIGHT = 2.0  # fall of the cost that tells nothing
+CREEPING = 0.03  # share of the way to a cost aimed at, below which a step is the last
 # error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
 FORETOLD = 0.1
 
@@ -162,6 +163,7 @@ def fit(
     weights: Weights | None = None,
     remainders: Sequence[np.ndarray] | None = None,
     most: float = np.inf,
+    aim: float = np.inf,
     exact: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
@@ -177,6 +179,7 @@ def fit(
         weights: those to fit under; of the start where None.
         remainders: geometric remainders to start from.
         most: cost of the start above which there is no fit.
+        aim: cost that decides: a fit above it that only creeps towards it (``CREEPING``) ends, not converged.
         exact: beside laws of the gears the last steps, and the information, are by exact derivatives (``jacobian``),
             which take several times as long. Beside others, and in motions, which hardly show springs, these add
             nothing.
@@ -276,6 +279,8 @@ def fit(
             if converged:
                 break
             fine, columns = True, []
+        if gain < CREEPING * (cost - aim):
+            break
     if np.any(drift):
         model, preds, Ws, _ = _settled(problem, settled, model, weights)
     if fine != exact or not columns:

@@ -513,7 +513,7 @@ def test_a_candidate_that_turned_far_goes_on_before_it_is_compared(identified, n
     _, setup, result = identified
     begun = []
 
-    def told(problem, model, *args):
+    def told(problem, model, *args, **kwargs):
         (effect,) = model.effects
         begun.append(effect.p[2])
         there = replace(effect, p=np.array([*effect.p[:2], tilt if len(begun) == 1 else 0.0]))
@@ -1293,7 +1293,7 @@ def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no
     loud = replace(baseline, costs=10.0 * baseline.counts)
     steps = []
 
-    def once(problem, model, weights, remainders, iterations=10, most=np.inf):
+    def once(problem, model, weights, remainders, iterations=10, most=np.inf, aim=np.inf):
         steps.append(iterations)
         return replace(
             loud, model=model, costs=baseline.counts + left * (loud.costs - baseline.counts), converged=False
@@ -1313,7 +1313,7 @@ def test_a_ripple_is_begun_at_all_wave_numbers_that_explain_nearly_as_much(ident
     h = next(h for h in catalogue(setup.problem.structure) if h.key == ("cogging", "elbow_joint"))
     loud = replace(baseline, costs=10.0 * baseline.counts)
 
-    def once(problem, model, weights, remainders, iterations=10, most=np.inf):
+    def once(problem, model, weights, remainders, iterations=10, most=np.inf, aim=np.inf):
         wave = model.effects[-1].value("periods_per_rev")
         return replace(loud, model=model, costs=(2.0 if wave == 202.0 else 5.0) * baseline.counts, converged=True)
 
