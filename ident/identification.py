@@ -17,6 +17,7 @@ from ident.group import Group
 from ident.inverse import Sampling
 from ident.noise import (
     DOUBT,
+    alike_at_all_lines,
     drifting,
     power_at_fast_lines,
     sample_noise,
@@ -216,17 +217,27 @@ def whitened(problem: Problem, result: Fit, found: Sequence[Prediction]) -> list
 
 
 def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
-    """Sample noise that was guessed, raised to what lines show that nothing excites, where periods show no scatter."""
-    guessed = guessed_noise(dataset)
+    """Sample noise, raised to what lines show that nothing excites, where periods show no scatter.
+
+    Noise that is given is raised where all that is left is alike at all lines and joints: it says nothing of noise whose
+    samples go together.
+    """
     unknown = all(g.window is None and not g.shows_noise for g in problem.groups)
-    if not unknown or not any(guessed) or result.chi2_per_dof <= DETECTION_EXCESS:
+    if not unknown or result.chi2_per_dof <= DETECTION_EXCESS:
         return problem
-    found = predictions(problem, result.model, result.remainders)
-    factor = np.sqrt(unexcited_noise(problem.groups, whitened(problem, result, found)))
-    q_std, tau_std = (
-        std * factor if guess else std for std, guess in zip((problem.q_std, problem.tau_std), guessed, strict=True)
+    left, guessed = (
+        whitened(problem, result, predictions(problem, result.model, result.remainders)),
+        guessed_noise(dataset),
     )
-    return replace(problem, q_std=q_std, tau_std=tau_std) if factor > 1.0 else problem
+    power = unexcited_noise(problem.groups, left) if any(guessed) else alike_at_all_lines(problem.groups, left)
+    if power is None or not np.any(power > 1.0):
+        return problem
+    raised = guessed if any(guessed) else (True, True)
+    factor = np.sqrt(np.maximum(power, 1.0))
+    q_std, tau_std = (
+        std * factor if r else std for std, r in zip((problem.q_std, problem.tau_std), raised, strict=True)
+    )
+    return replace(problem, q_std=q_std, tau_std=tau_std)
 
 
 def under_noise_that_is_left(

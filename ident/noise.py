@@ -25,6 +25,7 @@ UNLIKELY = 20.0  # nats below the likeliest level
 ROUNDED = 1e-9  # noise of the torque over its size, at least: what rounding leaves of records without noise
 LEAST_VARIANCE = 1e-140  # of a line, of records without any noise
 FLAT = 1.3  # power left at excited lines, over that at the others, up to which both are noise
+FEW_LINES = 100  # lines of a kind, below which they tell nothing of their power
 QUIET = 0.75  # quantile of the power of the lines of a band, up to which they hold noise
 DOUBT = 1.5  # of the power of noise, by which what such lines hold may be too little
 SURE = 1.0  # standard deviations of that power, from the number of such lines
@@ -60,20 +61,20 @@ def residual_covariance(
     Args:
         group: the records.
         Z: (L, n, n) recorded torque per motor position.
-        tau_std, q_std: (n,) sample noise, used where nothing shows it (``_scatter``).
+        tau_std, q_std: (n,) sample noise, used where nothing shows it (``noise_alone``).
         samples: samples per period.
 
     The shape over frequency is that of white channel noise carried by ``Z``; what shows the noise alone
-    (``_scatter``) sets its size, and corrects its shape by a smooth matrix where there is enough of it.
+    (``noise_alone``) sets its size, and corrects its shape by a smooth matrix where there is enough of it.
     """
-    found = _scatter(group, Z)
+    found = noise_alone(group, Z)
     rounded = ROUNDED**2 * np.mean(np.sum(2.0 * np.abs(group.U[:, 1:]) ** 2, axis=1), axis=0) / samples
     if found is None:
         S = white_covariance(Z, tau_std**2 / samples + rounded, q_std**2 / samples)
         return S[: group.n_compared]
     d, lines, dof_line = found
     Zk = Z[: group.n_compared]
-    tau_var, q_var = group.known_noise or _white_levels(
+    tau_var, q_var = group.known_noise or white_levels(
         np.sum(np.abs(d[:, 1:]) ** 2, axis=0), Zk[lines[1:]], np.full(len(lines) - 1, dof_line)
     )
     S = white_covariance(Zk, tau_var + rounded, q_var)
@@ -89,7 +90,7 @@ def residual_covariance(
     return root @ shape @ np.conj(np.swapaxes(root, 1, 2))
 
 
-def _scatter(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+def noise_alone(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
     """What noise alone makes of the torque residual: (R, J, n) of which the sum of squares is the variance of the mean.
 
     With the lines (J,) of the period that it stands at, and its degrees of freedom per line. By what periods differ by,
@@ -113,7 +114,7 @@ def sample_noise(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Standard deviation of white noise on torque and position samples, (n,) each.
 
-    From what shows the noise of the torque residual alone (``_scatter``), in all groups together; None where nothing
+    From what shows the noise of the torque residual alone (``noise_alone``), in all groups together; None where nothing
     does.
 
     Args:
@@ -122,7 +123,7 @@ def sample_noise(
     """
     power, gains, dof = [], [], []
     for group, Z, count in zip(groups, impedances, samples, strict=True):
-        found = _scatter(group, Z)
+        found = noise_alone(group, Z)
         if found is None:
             continue
         d, lines, dof_line = found
@@ -131,11 +132,11 @@ def sample_noise(
         dof.append(np.full(len(lines) - 1, dof_line))
     if not power:
         return None
-    tau_var, q_var = _white_levels(*map(np.concatenate, (power, gains, dof)))
+    tau_var, q_var = white_levels(*map(np.concatenate, (power, gains, dof)))
     return np.sqrt(tau_var), np.sqrt(q_var)
 
 
-def _white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def white_levels(power: np.ndarray, Z: np.ndarray, dof: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Channel variances, (n,) each, of the line power (K, n) of the residual.
 
     Few lines may be likeliest without any noise of the torque: beside the likeliest noise of the positions its mean
@@ -230,6 +231,34 @@ def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> 
         return 1.0
     at_excited, at_others = power / count
     return float(max(at_others, 1.0)) if at_excited < FLAT * at_others else 1.0
+
+
+def alike_at_all_lines(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> np.ndarray | None:
+    """Power (n,) of what a model leaves, over that of the noise it was whitened with, where that is noise; None else.
+
+    It is where each joint is left as much at excited lines as at other odd ones and at even ones near by, and most
+    joints are left more than noise as given. What a linear model lacks shows at excited lines alone, a distortion at
+    odd ones more than at even ones or the other way round, and both at a joint of their own (Pintelon and Schoukens
+    2012, 4.3).
+
+    Args:
+        whitened: as of ``unexcited_noise``.
+    """
+    n = whitened[0].shape[2]
+    ratio, count = np.zeros((3, n)), np.zeros((3, 1))
+    total, lines = np.zeros(n), 0
+    for group, Z in zip(groups, whitened, strict=True):
+        power = np.abs(Z[:, 1:]) ** 2
+        near = mean_over_lines(power.mean(axis=0), BAND_LINES)
+        excited, odd = group.excited[:, 1 : Z.shape[1]], np.arange(1, Z.shape[1]) % 2 == 1
+        for i, kind in enumerate((excited, ~excited & odd, ~excited & ~odd)):
+            ratio[i] += np.sum((power / near)[kind], axis=0)
+            count[i] += np.sum(kind)
+        total, lines = total + 0.5 * np.sum(power, axis=(0, 1)), lines + power[..., 0].size
+    told = count[:, 0] >= FEW_LINES
+    mean, left = ratio[told] / count[told], total / max(lines, 1)
+    alike = told[0] and np.any(told[1:]) and mean.max() < FLAT * mean.min()
+    return left if n > 1 and alike and np.sum(left > FLAT) > n / 2 else None
 
 
 def torque_noise_left(left: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> np.ndarray:

@@ -2,6 +2,7 @@
 is never less than noise."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from ident.identification import (
     with_noise_of_fast_lines,
     with_noise_that_is_left,
 )
-from ident.noise import DOUBT, torque_noise_left
+from ident.noise import DOUBT, alike_at_all_lines, torque_noise_left
 from ident.parallel import Workers
 from ident.problem import predictions
 from ident.refits import reweighted
@@ -61,6 +62,51 @@ def test_noise_of_positions_that_rises_steeply_within_a_band_does_not_hide_that_
 def test_few_lines_tell_nothing_of_the_noise():
     share = np.full((8, 2), 0.5)
     assert np.array_equal(torque_noise_left([spectra(np.random.default_rng(0), 0.1 * share)], [share]), np.ones(2))
+
+
+@pytest.mark.parametrize("lacks", ["nothing", "excited lines", "odd lines", "even lines", "noise as given"])
+def test_what_is_alike_at_all_lines_and_joints_is_noise(lacks):
+    rng = np.random.default_rng(6)
+    Z = spectra(rng, np.full((301, 3), 5.0), records=4)
+    excited = np.zeros((4, 301), bool)
+    excited[:, 1:200:4] = True
+    also = {
+        "nothing": np.s_[:0],
+        "excited lines": np.s_[:, 1:200:4],
+        "odd lines": np.s_[:, 1::2],
+        "even lines": np.s_[:, 2::2],
+        "noise as given": np.s_[..., :2],
+    }[lacks]
+    Z[also] *= np.sqrt(0.2 if lacks == "noise as given" else 2.0)
+    groups = [SimpleNamespace(excited=excited)]
+    found = alike_at_all_lines(groups, [Z])
+    assert found == pytest.approx(np.full(3, 2.5), rel=0.1) if lacks == "nothing" else found is None
+    assert alike_at_all_lines(groups, [Z[..., :1]]) is None  # a single joint has none beside it
+    assert np.array_equal(excited.sum(axis=1), np.full(4, 50))  # as it was
+
+
+@pytest.mark.parametrize("joints", [slice(None), slice(2, 3)])
+def test_noise_that_is_given_says_nothing_of_its_colour(ur10, tmp_path, joints):
+    """Single periods show no scatter. Noise whose samples go together has several times its power in the band."""
+    plan = small_plan(ur10, 33, points=2, periods=2, transient_periods=1)
+    data = through_files(run_experiment(plan, seed=33), tmp_path)
+    given = 3.0 * ur10.array("tau_std")
+    rng = np.random.default_rng(8)
+
+    def single(s):
+        last = s.part(slice(-s.period, None))
+        steps = rng.normal(size=last["tau"].shape) * np.sqrt(1.0 - 0.7**2) * given
+        last["tau"] = last["tau"].copy()
+        last["tau"][:, joints] += scipy.signal.lfilter([1.0], [1.0, -0.7], steps, axis=0)[:, joints]
+        return replace(s, periods=1, transient_periods=0, **last)
+
+    data = replace(data, segments=tuple(single(s) for s in data.segments), q_std=ur10.array("q_std"), tau_std=given)
+    setup, first = identify(data)
+    if joints == slice(2, 3):
+        assert np.array_equal(setup.problem.tau_std, given)
+    else:
+        assert np.all(setup.problem.tau_std > 1.2 * given)
+        assert 0.9 < first.chi2_per_dof < 1.1
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ident.identification import identify, set_up
-from ident.noise import LEVEL_STEPS, _mean_level, _white_levels, likeliest_levels, residual_covariance
+from ident.noise import LEVEL_STEPS, _mean_level, likeliest_levels, residual_covariance, white_levels
 from ident.problem import predictions
 from ident.transients import ends_of_transients
 
@@ -67,7 +67,7 @@ def test_the_likeliest_levels_are_those_of_the_noise(torque, lines):
     for _ in range(20):
         expected = tau + np.einsum("kij,j->ki", np.abs(gain) ** 2, q)
         power = expected * rng.gamma(8.0, 1.0 / 8.0, size=expected.shape)
-        errors.append(np.concatenate(_white_levels(power, gain, np.full(lines, 8.0))) / np.concatenate([tau, q]) - 1.0)
+        errors.append(np.concatenate(white_levels(power, gain, np.full(lines, 8.0))) / np.concatenate([tau, q]) - 1.0)
     assert np.abs(np.mean(errors, axis=0)).max() < 0.1
     # Eight degrees of freedom a line, and a third of the lines or more hold each.
     assert np.std(errors, axis=0).max() < 2.0 / np.sqrt(8.0 * lines / 3.0)
@@ -82,7 +82,7 @@ def test_few_lines_are_not_told_to_hold_no_noise():
     for _ in range(300):
         power = (1.0 + gain[:, 0] ** 2) * rng.exponential(size=(14, 1))
         likeliest.append(likeliest_levels(power, gain**2, np.ones((14, 1)))[0][0])
-        taken.append(_white_levels(power, gain, np.ones(14))[0][0])
+        taken.append(white_levels(power, gain, np.ones(14))[0][0])
     assert np.quantile(likeliest, 0.05) < 0.02
     assert np.quantile(taken, 0.005) > 0.1
     assert 0.7 < np.median(taken) < 3.0  # its mean is that of a long tail
@@ -116,14 +116,14 @@ def test_records_without_noise_have_none(silent):
     gain = np.geomspace(1e-3, 1e2, 100)[:, None, None] * np.eye(2)
     power = np.random.default_rng(3).exponential(size=(100, 2))
     power[:, silent] = 0.0
-    tau, q = _white_levels(power, gain, np.ones(100))
+    tau, q = white_levels(power, gain, np.ones(100))
     assert np.all(np.isfinite([tau, q])) and np.all(tau > 0.0) and np.all(q > 0.0)
     assert np.all(tau[silent] < 1e-20) and np.all(q[silent] < 1e-20)
 
 
 def test_noise_without_bounds_is_refused():
     with pytest.raises(FloatingPointError, match="without bounds"):
-        _white_levels(np.full((20, 2), np.inf), np.ones((20, 2, 2)), np.ones(20))
+        white_levels(np.full((20, 2), np.inf), np.ones((20, 2, 2)), np.ones(20))
 
 
 @pytest.fixture(scope="module")
