@@ -235,6 +235,12 @@ def judge(row: dict) -> dict:
     truth, causes = row["truth"], row["causes"]
     named = {(c["effect"], c["joint"]) for c in causes if c["probability"] > 0.5}
     wanted = {(t["effect"], t["place"]) for t in truth if not t["effect"].startswith("outside:")}
+    # What drifts in the plant is viscous friction and, if it has any, Coulomb friction of its own.
+    wanted |= {
+        ("coulomb_friction", t["place"])
+        for t in truth
+        if t["effect"] == "friction_drift" and t["parameters"].get("coulomb")
+    }
     right = named == wanted
     errors = []
     for t in truth:

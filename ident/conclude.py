@@ -21,6 +21,7 @@ from ident.problem import Problem
 from ident.quantization import Steps
 from ident.reporting import describe, where
 from ident.rigid import RigidFit
+from ident.tones import Tone
 from ident.torque_fit import Fit
 from ident.trust import (
     LEFT_ERROR,
@@ -33,6 +34,7 @@ from ident.trust import (
     shadowed,
     shown,
     too_fast,
+    within_steps,
 )
 from ident.units import linear_names, parameter_unit, text_at, unit_at
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
@@ -40,6 +42,7 @@ from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value,
 AXIS_STEP = 1e-6  # of a tilt
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
+TOLD = 0.2  # standard deviation of the Coulomb friction that drifts over its size, up to which the data show it
 RIVAL = 0.1  # of the probability of a cause, above which the sentence tells a rival too
 
 
@@ -69,12 +72,14 @@ def conclude(
     separating: NextExperiment | None = None,
     rigid: RigidFit | None = None,
     belied: Collection[tuple[str, str]] = (),
+    tones: Sequence[Tone] = (),
 ) -> Verdict:
     """Put the result into the words and numbers of verdict.json.
 
     Args:
         baseline: the first model, and ``first`` what it predicts.
         belied: causes, by ``key``, that held-out data deny (``trust.denied``).
+        tones: what does not repeat with the period. Where nothing else is found it is an unknown cause.
         rigid: inertias of the links where they were found too: ``result`` is then about the model with them.
     """
     final = result.final
@@ -99,37 +104,41 @@ def conclude(
         doubtful = (
             pointless(effect, final.model.par.stiffness[effect.hypothesis.joint])
             or too_fast(problem, last, effect)
+            or within_steps(effect, steps)
             or shadowed(found, result.rounds)
         )
         if doubtful or effect.hypothesis.key in belied or not shown(effect, final, covariance):
             trust *= known_probability(1.0, True)
         causes.append(_cause(effect, found.candidates, final, covariance, trust))
+        causes += _drifting_friction(causes[-1])
     linear = linear_names(dataset.robot)
     direct = [_rounded(x, dataset.joints[x.joint], linear) for x in steps]
     direct += [_late(x, dataset.joints[x.joint]) for x in late]
     causes += direct
-    detected = result.detected or bool(direct)
+    alone = bool(tones) and not result.detected and not direct
+    detected, unknown = result.detected or bool(direct) or alone, unknown or alone
     seen = where(problem, baseline, first) if result.detected else ()
     if not seen:
         seen += tuple(Where(dataset.joints[x.joint], "q", "position in steps", 1.0) for x in steps)
+        seen += tuple(Where(dataset.joints[x.joint], "tau", f"a tone at {x.frequency_hz:.4g} Hz", 1.0) for x in tones)
         seen += tuple(Where(dataset.joints[x.joint], "q_link", "position that follows the velocity", 1.0) for x in late)
     verdict = UNKNOWN if unknown else "noise floor reached"
     values, undetermined = baseline_values(final)
     others = extended_baseline(final, covariance) | ({} if rigid is None else inertia_values(rigid))
     values |= others
     undetermined += tuple(k for k, v in others.items() if not v.std < UNDETERMINED * abs(v.value))
-    description = describe(problem, final, last) if unknown else None
+    description = describe(problem, final, last) if unknown and not alone else None
     return Verdict(
         dataset=dataset.name,
         baseline=values,
         discrepancy=Discrepancy(
             detected,
-            0.0 if direct else result.p_value,
+            0.0 if direct or alone else result.p_value,
             baseline.chi2_per_dof,
             seen,
         ),
         causes=tuple(causes),
-        unexplained_share=float(left),
+        unexplained_share=1.0 if alone else float(left),
         unexplained_verdict=verdict,
         gain=gain,
         next_experiment=separating.text if separating else advice(causes, unknown, len(dataset.joints)),
@@ -141,6 +150,7 @@ def conclude(
             *(few_note(final) if few and causes else ()),
             *faint_note(result),
             *(() if named_effects(final) else drift_note(problem)),
+            *(tone_note(x, dataset.joints[x.joint]) for x in tones),
             *(belied_note(e) for e in named_effects(final) if e.hypothesis.key in belied),
             *(nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy),
             *(record_note(e) for e in named_effects(final) if is_along_record(e.hypothesis)),
@@ -228,6 +238,14 @@ def drift_note(problem: Problem) -> tuple[str, ...]:
     )
 
 
+def tone_note(tone: Tone, joint: str) -> str:
+    """What shakes a joint at a frequency of its own, in a sentence."""
+    return (
+        f"At {joint} the torque holds a tone near {tone.frequency_hz:.4g} Hz that does not repeat with the period of the excitation,"
+        f" {tone.ratio:.3g} times the power of the noise there: something else shakes it, and counts as noise here."
+    )
+
+
 def belied_note(effect: Effect) -> str:
     """Why a cause is not trusted that held-out data deny, in a sentence."""
     h = effect.hypothesis
@@ -299,6 +317,24 @@ def _cause(effect: Effect, candidates: Sequence[Candidate], final: Fit, covarian
         channel="q" if h.channel == "position" else None,
         joints=joints,
         with_load=h.options.get("with_load", False),
+    )
+
+
+def _drifting_friction(drift: Cause) -> tuple[Cause, ...]:
+    """The Coulomb friction that changes with a ``friction_drift``: the model lacks it too, and the catalogue has it
+    under a name of its own."""
+    size = drift.parameters.get("coulomb")
+    if drift.effect != "friction_drift" or size is None or not size.std < TOLD * size.value:
+        return ()
+    return (
+        Cause(
+            effect="coulomb_friction",
+            joint=drift.joint,
+            parameters={"torque": size},
+            probability=drift.probability,
+            evidence=f"Of the friction of {drift.joint} that drifts {size.value:.3g} {size.unit} do not depend on the speed, at the start.",
+            alternatives=(),
+        ),
     )
 
 

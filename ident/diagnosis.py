@@ -36,6 +36,7 @@ from ident.period_checks import unrepeated
 from ident.problem import NOT_COMPUTED, predictions
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, carried_over, fit_rigid
+from ident.tones import find_tones
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, fit
 from ident.trust import LEFT_ERROR, denied, known_probability
@@ -133,8 +134,9 @@ def diagnose_fully(
     late = find_link_delays(recorded, last, problem.sampling.sample_time)
     separating = separating_experiment(problem, result)
     belied = {r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)}
+    tones = find_tones(recorded, [p.sampled_impedance for p in last])
     verdict = conclude(
-        dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied
+        dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied, tones
     )
     if setup.ran_away:
         names = ", ".join(setup.ran_away)

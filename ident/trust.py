@@ -11,6 +11,7 @@ from ident.attribute import Attribution
 from ident.baseline import DETECTION_EXCESS, JOINT_EXCESS, implausible
 from ident.contests import SAME_PERIOD
 from ident.costs import fair_costs, weighted_cost
+from ident.evidence import WAVE, is_wave
 from ident.extended import Prediction
 from ident.faint import SHADOW
 from ident.group import Group
@@ -19,6 +20,7 @@ from ident.hypotheses.hypothesis import RIPPLE
 from ident.model import Effect
 from ident.problem import NOT_COMPUTED, Problem, data_counts, predictions
 from ident.pruning import UNTOLD
+from ident.quantization import Steps
 from ident.refits import settled
 from ident.rounds import MIN_EVIDENCE, Round
 from ident.torque_fit import Fit
@@ -157,6 +159,14 @@ def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect
         slow = wave_number * speed < group.omega[group.n_compared - 1]
         path += float(np.sum(speed[slow])) * group.period_time / speed.shape[1]
     return wave_number * path < FEWEST_PERIODS * 2.0 * np.pi
+
+
+def within_steps(effect: Effect, steps: Sequence[Steps]) -> bool:
+    """Whether an error of a position is smaller than the steps in which this comes: it may be what these leave."""
+    if effect.hypothesis.channel != "position" or not is_wave(effect.hypothesis.parameters):
+        return False
+    amplitude = np.hypot(*(effect.value(name) for name in WAVE))
+    return any(x.joint == effect.hypothesis.joint and amplitude < x.resolution for x in steps)
 
 
 def shadowed(found: Round, rounds: Sequence[Round]) -> bool:

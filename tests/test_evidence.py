@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, companions, less_errors_of_laws
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
-from ident.conclude import _cause, conclude, faint_note
+from ident.conclude import _cause, _drifting_friction, conclude, faint_note
 from ident.contests import alike, best_of_each, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
@@ -52,7 +52,7 @@ from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, 
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
 from ident.trust import shadowed, shown
-from ident.verdict import UNKNOWN, Gain
+from ident.verdict import UNKNOWN, Cause, Gain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -1421,6 +1421,15 @@ def test_rivals_far_behind_leave_a_contest_and_the_cause_itself_stays(costs, kep
     times as much."""
     ran = [Candidate(None, SimpleNamespace(cost=c, count=1000), 0.0) for c in costs]
     assert in_reach(ran) == ran[:kept]
+
+
+@pytest.mark.parametrize(("size", "std", "told"), [(0.7, 0.02, True), (0.7, 0.2, False), (1e-6, 1e-5, False)])
+def test_coulomb_friction_that_drifts_is_a_cause_of_its_own(size, std, told):
+    parameters = {"relative_change": Value(-0.4, 0.01, "1"), "coulomb": Value(size, std, "N m")}
+    drift = Cause("friction_drift", "elbow_joint", parameters, 0.97, "", ())
+    named = [(c.effect, c.joint, c.probability, c.parameters) for c in _drifting_friction(drift)]
+    assert named == ([("coulomb_friction", "elbow_joint", 0.97, {"torque": parameters["coulomb"]})] if told else [])
+    assert not _drifting_friction(replace(drift, effect="stribeck_friction"))
 
 
 def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named):

@@ -5,9 +5,12 @@ import pytest
 
 from ident.dataset_io import load_dataset, save_dataset
 from ident.excitation import operating_points
+from ident.hypotheses.sensing import encoder_eccentricity, sensor_lag
 from ident.identification import identify
+from ident.model import Effect
 from ident.noise import drifting
-from ident.quantization import _blurred_grid, _exact_grid, rounding_error, with_rounding
+from ident.quantization import Steps, _blurred_grid, _exact_grid, rounding_error, with_rounding
+from ident.trust import within_steps
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.effects import EFFECTS
@@ -116,3 +119,14 @@ def test_what_circulates_in_the_loop_is_no_rounding_that_averages_out(tmp_path):
     # As told by the positions alone these would repeat far less.
     less = with_rounding(setup.problem.groups, setup.steps, data)
     assert np.mean([g.rounding[:, 1] for g in less]) < 0.6 * np.mean([g.rounding[:, 1] for g in setup.problem.groups])
+
+
+def test_an_error_within_the_steps_of_an_encoder_is_not_trusted():
+    steps = (Steps(2, 1e-4, 1e-9),)
+
+    def within(joint, *p):
+        return within_steps(Effect(encoder_eccentricity(joint, f"joint_{joint}"), np.array(p)), steps)
+
+    assert within(2, 6e-5, -6e-5) and not within(2, 9e-5, 6e-5)
+    assert not within(1, 6e-5, -6e-5)
+    assert not within_steps(Effect(sensor_lag(2, "joint_2"), np.array([1e-5])), steps)

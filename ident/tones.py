@@ -1,0 +1,70 @@
+"""Tones of the torque that do not repeat with the period: what shakes a joint at a frequency of its own.
+
+Such a tone is in the scatter between periods, where it would count as noise. It stands at one line and leaks to those
+next to it, where noise of samples, carried to the torque by the impedance of the arm, is smooth over lines once that
+impedance is taken off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from ident.group import Group
+from ident.noise import noise_alone, white_covariance, white_levels
+
+REACH, NEXT = 12, 2  # lines on either side that say what noise is near by, but for those next to a tone
+LOUDEST = 10.0  # power of a line over that of noise near by, from which it is a tone
+BY_CHANCE = 1e-9  # probability of such a line in noise anywhere
+
+
+@dataclass(frozen=True)
+class Tone:
+    """A line that stands above the scatter between periods near by.
+
+    Attributes:
+        joint: where it is loudest; frequency_hz: of the line, to within one.
+        ratio: its power over that of the scatter.
+    """
+
+    joint: int
+    frequency_hz: float
+    ratio: float
+
+
+def find_tones(groups: Sequence[Group], impedances: Sequence[np.ndarray]) -> tuple[Tone, ...]:
+    """The loudest tone of each joint that has any, loudest first; of records of several periods.
+
+    Args:
+        impedances: (L, n, n) recorded torque per motor position, by group.
+    """
+    loudest: dict[int, Tone] = {}
+    for group, Z in zip(groups, impedances, strict=True):
+        if group.window is not None or group.U_periods.shape[1] < 2:
+            continue
+        ratio, dof = over_noise(group, Z)
+        chance = ratio.size * scipy.stats.gamma.sf(dof * ratio, dof)
+        for line, j in np.argwhere((ratio > LOUDEST) & (chance < BY_CHANCE)):
+            tone = Tone(int(j), float(group.omega[line] / (2.0 * np.pi)), float(ratio[line, j]))
+            if tone.joint not in loudest or tone.ratio > loudest[tone.joint].ratio:
+                loudest[tone.joint] = tone
+    return tuple(sorted(loudest.values(), key=lambda t: -t.ratio))
+
+
+def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, float]:
+    """Power (K, n) of the scatter at each line over that near by, ones at the mean; and its degrees of freedom."""
+    d, _, dof = noise_alone(group, Z)
+    power = np.sum(np.abs(d) ** 2, axis=0)
+    levels = white_levels(power[1:], Z[1 : len(power)], np.full(len(power) - 1, dof))
+    root = np.linalg.cholesky(white_covariance(Z[: len(power)], *levels))
+    white = np.sum(np.abs(np.linalg.solve(root[None], d[..., None])[..., 0]) ** 2, axis=0)
+    middle = scipy.stats.gamma.median(dof) / dof  # of the power of lines of noise, over its mean
+    padded = np.pad(white[1:], ((REACH, REACH), (0, 0)), constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * REACH + 1, axis=0)
+    near = np.delete(around, np.arange(REACH - NEXT, REACH + NEXT + 1), axis=-1)
+    ratio = np.ones_like(white)
+    ratio[1:] = white[1:] * middle / np.maximum(np.nanmedian(near, axis=-1), 1e-300)
+    return ratio, dof
