@@ -107,6 +107,9 @@ class Robot:
 def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Robot:
     """Read a robot folder: a name in ``robot_assets`` or a path.
 
+    Args:
+        relative_to: folder of the file that names the robot. A robot of that name which lies there comes first.
+
     Raises:
         DataError: where the folder, a key or the URDF is missing or wrong.
     """
@@ -166,7 +169,8 @@ def _folder(name_or_path: str | Path, relative_to: Path | None) -> Path:
     if not candidates:
         candidates = [(relative_to or Path.cwd()) / text]
         if "/" not in text and "\\" not in text:
-            candidates.insert(0, ASSETS / text)
+            # A folder that lies beside the file that names it is meant, whatever it is called.
+            candidates.insert(0 if relative_to is None else 1, ASSETS / text)
     for folder in candidates:
         if exists(folder / "robot.toml"):
             return folder.resolve()

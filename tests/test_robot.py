@@ -44,6 +44,15 @@ def test_an_unknown_robot_lists_the_known_ones():
         load_robot("no-such-arm")
 
 
+def test_a_robot_beside_the_file_that_names_it_is_meant(tmp_path, ur10):
+    """Though a robot of the project has its name: this one hangs on a wall."""
+    assert load_robot("ur10", tmp_path).gravity == ur10.gravity
+    (tmp_path / "ur10").mkdir()
+    _folder(tmp_path / "ur10", ur10, "gravity = [0.0, 0.0, -9.81]", "gravity = [0.0, -9.81, 0.0]")
+    assert load_robot("ur10", tmp_path).gravity == (0.0, -9.81, 0.0)
+    assert load_robot("ur10").gravity == ur10.gravity
+
+
 def test_entities_in_a_urdf_are_refused(tmp_path, ur10):
     folder = _folder(tmp_path, ur10, 'package = "example-robot-data"\n', "")
     text = (folder / "robot.toml").read_text().replace("robots/ur_description/urdf/ur10_robot.urdf", "bomb.urdf")
