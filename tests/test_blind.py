@@ -154,6 +154,7 @@ def test_a_cable_that_gives_before_it_slips_is_named_with_its_friction(ur10, tmp
     assert cause.parameters["friction"].value == pytest.approx(1.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
     """The catalogue lacks it, but a model with it is measured and written."""
     from dataclasses import dataclass

@@ -117,8 +117,8 @@ MORE_DRIVE = [
     make_effect("cogging", "drive", amplitude=0.2, periods_per_rev=40.0, phase=0.3),
     make_effect("sensor_delay", "drive", delay=1e-3),
 ]
-ARM = [make_effect("payload", "flange", mass=2.0, com_x=0.02, com_y=0.0, com_z=0.08)]
-MORE_ARM = [
+ARM = [
+    make_effect("payload", "flange", mass=2.0, com_x=0.02, com_y=0.0, com_z=0.08),
     make_effect("coulomb_friction", "elbow_joint", torque=3.0, asymmetry=0.1),
     make_effect("torque_delay", "shoulder_lift_joint", delay=1.3e-3),
     make_effect("hardening_stiffness", "shoulder_lift_joint", cubic=5e9),
@@ -129,11 +129,9 @@ MORE_ARM = [
 ]
 
 
-def some_slow(effects, more):
-    return [*effects, *(pytest.param(e, marks=pytest.mark.slow) for e in more)]
-
-
-@pytest.mark.parametrize("effect", some_slow(DRIVE, MORE_DRIVE), ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    "effect", [*DRIVE, *(pytest.param(e, marks=pytest.mark.slow) for e in MORE_DRIVE)], ids=lambda e: e.name
+)
 def test_the_simulated_gain_of_a_drive_is_the_predicted_one(effect):
     predicted, simulated = both_gains(drive_data(effect), effect)
     assert predicted.gap_closed > 0.9
@@ -141,7 +139,8 @@ def test_the_simulated_gain_of_a_drive_is_the_predicted_one(effect):
     assert simulated.before == pytest.approx(predicted.before, rel=0.05)
 
 
-@pytest.mark.parametrize("effect", some_slow(ARM, MORE_ARM), ids=lambda e: e.name)
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ARM, ids=lambda e: e.name)
 def test_the_simulated_gain_of_an_arm_is_the_predicted_one(effect):
     predicted, simulated = both_gains(arm_data(effect), effect, segments=1)
     assert predicted.gap_closed > 0.85
