@@ -36,7 +36,7 @@ from ident.period_checks import unrepeated
 from ident.problem import NOT_COMPUTED, predictions
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, carried_over, fit_rigid
-from ident.tones import find_tones
+from ident.tones import Tone, find_tones
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, fit
 from ident.trust import LEFT_ERROR, denied, known_probability
@@ -134,7 +134,7 @@ def diagnose_fully(
     late = find_link_delays(recorded, last, problem.sampling.sample_time)
     separating = separating_experiment(problem, result)
     belied = {r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)}
-    tones = find_tones(recorded, [p.sampled_impedance for p in last])
+    tones = tones_of(recorded, last)
     verdict = conclude(
         dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied, tones
     )
@@ -208,6 +208,14 @@ def held_out(
     gain = leave_one_out(setup, nominal, baseline, result, renewed, affected, workers)
     shown = problem.groups[:1]
     return gain, shown, [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
+
+
+def tones_of(recorded: Sequence[Group], found: Sequence[Prediction]) -> tuple[Tone, ...]:
+    """``find_tones`` beside a model; none where its impedance cannot carry noise."""
+    try:
+        return find_tones(recorded, [p.sampled_impedance for p in found])
+    except (np.linalg.LinAlgError, ArithmeticError):
+        return ()
 
 
 def harmful(gain: Gain | None) -> bool:

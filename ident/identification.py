@@ -225,10 +225,8 @@ def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fi
     unknown = all(g.window is None and not g.shows_noise for g in problem.groups)
     if not unknown or result.chi2_per_dof <= DETECTION_EXCESS:
         return problem
-    left, guessed = (
-        whitened(problem, result, predictions(problem, result.model, result.remainders)),
-        guessed_noise(dataset),
-    )
+    left = whitened(problem, result, predictions(problem, result.model, result.remainders))
+    guessed = guessed_noise(dataset)
     power = unexcited_noise(problem.groups, left) if any(guessed) else alike_at_all_lines(problem.groups, left)
     if power is None or not np.any(power > 1.0):
         return problem

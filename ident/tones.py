@@ -14,10 +14,11 @@ import numpy as np
 import scipy.stats
 
 from ident.group import Group
-from ident.noise import noise_alone, white_covariance, white_levels
+from ident.noise import ROUNDED, noise_alone, white_covariance, white_levels
 
 REACH, NEXT = 12, 2  # lines on either side that say what noise is near by, but for those next to a tone
 LOUDEST = 10.0  # power of a line over that of noise near by, from which it is a tone
+QUIETEST = 0.01  # least power of noise near by, over that of all lines
 BY_CHANCE = 1e-9  # probability of such a line in noise anywhere
 
 
@@ -58,13 +59,15 @@ def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, float]:
     """Power (K, n) of the scatter at each line over that near by, ones at the mean; and its degrees of freedom."""
     d, _, dof = noise_alone(group, Z)
     power = np.sum(np.abs(d) ** 2, axis=0)
-    levels = white_levels(power[1:], Z[1 : len(power)], np.full(len(power) - 1, dof))
-    root = np.linalg.cholesky(white_covariance(Z[: len(power)], *levels))
+    torque, position = white_levels(power[1:], Z[1 : len(power)], np.full(len(power) - 1, dof))
+    # What rounding leaves of records without noise is none, and holds no tone.
+    torque = torque + ROUNDED**2 * np.mean(np.sum(2.0 * np.abs(group.U) ** 2, axis=1), axis=0)
+    root = np.linalg.cholesky(white_covariance(Z[: len(power)], torque, position))
     white = np.sum(np.abs(np.linalg.solve(root[None], d[..., None])[..., 0]) ** 2, axis=0)
     middle = scipy.stats.gamma.median(dof) / dof  # of the power of lines of noise, over its mean
     padded = np.pad(white[1:], ((REACH, REACH), (0, 0)), constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * REACH + 1, axis=0)
     near = np.delete(around, np.arange(REACH - NEXT, REACH + NEXT + 1), axis=-1)
     ratio = np.ones_like(white)
-    ratio[1:] = white[1:] * middle / np.maximum(np.nanmedian(near, axis=-1), 1e-300)
+    ratio[1:] = white[1:] * middle / np.maximum(np.nanmedian(near, axis=-1), QUIETEST)
     return ratio, dof

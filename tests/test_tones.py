@@ -50,6 +50,12 @@ def test_a_tone_that_repeats_with_the_period_is_no_scatter(clean):
     assert not tones(setup.problem, fit)
 
 
+def test_records_without_noise_hold_no_tone():
+    robot = load_robot("twomass")
+    setup, fit = identify(run_experiment(small_plan(robot, 3, period=1000, levels=(4.0,)), [], seed=3, noise=0.0))
+    assert not tones(setup.problem, fit)
+
+
 @pytest.mark.parametrize("amplitude", [0.0, 0.02])
 def test_what_shakes_a_drive_at_its_own_frequency_is_an_unknown_cause(tmp_path, amplitude):
     robot = load_robot("twomass")
