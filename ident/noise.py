@@ -252,7 +252,7 @@ def alike_at_all_lines(groups: Sequence[Group], whitened: Sequence[np.ndarray]) 
         near = mean_over_lines(power.mean(axis=0), BAND_LINES)
         excited, odd = group.excited[:, 1 : Z.shape[1]], np.arange(1, Z.shape[1]) % 2 == 1
         for i, kind in enumerate((excited, ~excited & odd, ~excited & ~odd)):
-            ratio[i] += np.sum((power / near)[kind], axis=0)
+            ratio[i] += np.sum((power / np.maximum(near, 1e-300))[kind], axis=0)
             count[i] += np.sum(kind)
         total, lines = total + 0.5 * np.sum(power, axis=(0, 1)), lines + power[..., 0].size
     told = count[:, 0] >= FEW_LINES

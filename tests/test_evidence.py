@@ -44,7 +44,7 @@ from ident.parallel import Workers
 from ident.posture import moved_by_gears
 from ident.problem import Weights, data_counts, predictions
 from ident.pruning import pruned, renamed, without_shadows
-from ident.refits import polish, refit, reweighted, settled, turned, under_own_noise
+from ident.refits import polish, refit, reweighted, settled, to_compete, turned, under_own_noise
 from ident.reporting import frf_views, most_affected
 from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
 from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
@@ -1421,6 +1421,25 @@ def test_rivals_far_behind_leave_a_contest_and_the_cause_itself_stays(costs, kep
     times as much."""
     ran = [Candidate(None, SimpleNamespace(cost=c, count=1000), 0.0) for c in costs]
     assert in_reach(ran) == ran[:kept]
+
+
+def test_a_fit_that_creeps_short_of_its_aim_is_left_there(identified):
+    """Near its end no step takes off 3 % of what the cost is above nothing; above a cost within reach it goes on."""
+    _, setup, result = identified
+    par = replace(result.model.par, stiffness=1.3 * result.model.par.stiffness)
+
+    def ended(**kwargs):
+        steps = []
+        start = replace(result.model, par=par)
+        found = fit(setup.problem, start, weights=result.weights, progress=steps.append, **kwargs)
+        return found, len(steps)
+
+    whole, all_steps = ended()
+    short, few = ended(aim=0.0)
+    assert whole.converged and not short.converged and few < all_steps
+    assert whole.cost < short.cost < 1.1 * whole.cost
+    near, steps = ended(aim=to_compete(whole.cost, whole.count))
+    assert near.converged and steps == all_steps and near.cost == whole.cost
 
 
 @pytest.mark.parametrize(("size", "std", "told"), [(0.7, 0.02, True), (0.7, 0.2, False), (1e-6, 1e-5, False)])

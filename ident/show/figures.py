@@ -67,9 +67,10 @@ def _subplots(rows: int = 1, columns: int = 1, **options):
     return fig, fig.subplots(rows, columns, **options)
 
 
-def _svg(fig: Figure) -> str:
+def _svg(fig: Figure, bbox: str | None = "tight") -> str:
+    """SVG of a figure; ``tight`` makes room for a legend that is wider than it."""
     buffer = io.StringIO()
-    fig.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    fig.savefig(buffer, format="svg", bbox_inches=bbox, transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
     for colour, variable in CSS.items():
         text = text.replace(colour, variable)
@@ -163,7 +164,7 @@ def frf_grid_figure(view: FrfView, joints: tuple[str, ...]) -> str:
             axes[0][i].set_title(joints[i], fontsize=6)
         fig.supxlabel("frequency, Hz", fontsize=8, y=0.02 / height)
         _legend(fig, axes[0][0], "upper center")
-        return _svg(fig)
+        return _svg(fig, None)
 
 
 def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...], unit: str) -> str:
