@@ -20,23 +20,19 @@ from scipy.spatial.transform import Rotation
 
 from robot_assets.errors import DataError
 from robot_assets.plausible import doubts
-from robot_assets.robot import Joint, Robot, load_robot
+from robot_assets.robot import ENCODER, NOISE, VELOCITY, WINDUP, Joint, Robot, load_robot
 from robot_assets.urdf import Description, read_urdf
 from robot_assets.values import LARGEST, exists
 
 GRAVITY = 9.81  # m/s2
 POSTURES = 64  # random ones, over which the seen inertia is taken
 GEAR_RATIO = 100.0  # of a strain-wave or cycloidal gear of an arm; 1 for a linear drive
-WINDUP = 1 / 150  # rad: how far a gear winds up under the torque limit
 SOFTEST = 5.0  # Hz: no anti-resonance is guessed below
 SCREW = 30.0  # Hz: anti-resonance of a ball screw with its carriage
 DAMPING = 0.05  # damping ratio of the gear
 ACCELERATION = 150.0  # rad/s2 that the torque limit gives the motor alone
 MATCH = 0.5  # motor inertia over the inertia carried, at the least
 DRAG = 0.1  # of the torque limit, taken by viscous friction at the velocity limit
-NOISE = 1e-4  # torque noise over the torque limit
-ENCODER = {False: 3e-6, True: 1e-6}  # position noise, rad or (True: prismatic) m
-VELOCITY = {False: np.pi, True: 1.0}  # velocity limit where the URDF has none, rad/s or m/s
 Carrier = tuple[int, np.ndarray, np.ndarray, bool]  # joint, axis, a point of the axis, linear
 MOST = 100  # driven joints
 LINEAR_UNITS = {"rad": "m", "N m": "N", "kg m2": "kg"}
@@ -96,7 +92,7 @@ def draft_robot(urdf: str | Path, lock: Mapping[str, float | None] | None = None
     inertia, weight = _seen(root, tree, names, locked)
     guesses, warnings = [], list(doubts(root))
     for j, name in enumerate(names):
-        guesses.append(_guess(elements[name], inertia[:, j], float(weight[:, j].max())))
+        guesses.append(_guess(tree, name, inertia[:, j], float(weight[:, j].max())))
         _check_figures(guesses[-1], path)
         if inertia[:, j].max() <= 0:
             warnings.append(f"{name} carries no mass in the URDF: complete its <inertial> or add a [[load]]")
@@ -177,10 +173,9 @@ def render(draft: Draft, name: str, urdf_name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _guess(element: ET.Element, inertia: np.ndarray, weight: float) -> JointGuess:
-    linear = element.get("type") == "prismatic"
-    limit = element.find("limit")
-    effort, velocity = (0.0 if limit is None else _positive(limit.get(key)) for key in ("effort", "velocity"))
+def _guess(tree: Description, name: str, inertia: np.ndarray, weight: float) -> JointGuess:
+    linear = tree.kinds[name] == "prismatic"
+    effort, velocity = tree.efforts[name], tree.speeds[name]
     carried = float(np.median(inertia))
     newton, rad, kg = (_unit(u, linear) for u in ("N m", "rad", "kg m2"))
     reasons = {"gear_ratio": 'GUESS: matters only for logs taken on the motor side (side = "motor" in a map)'}
@@ -220,7 +215,7 @@ def _guess(element: ET.Element, inertia: np.ndarray, weight: float) -> JointGues
     reasons["q_std"] = f"{rad}, GUESS: noise of the motor encoder"
     reasons["tau_std"] = f"{newton}, GUESS: {NOISE:g} of the torque limit"
     joint = Joint(
-        name=element.get("name", ""),
+        name=name,
         gear_ratio=ratio,
         motor_inertia=motor,
         stiffness=stiffness,
@@ -353,15 +348,6 @@ def _depth(elements: dict[str, ET.Element], link: str) -> int:
     while link in parent:
         link, steps = parent[link], steps + 1
     return steps
-
-
-def _positive(text: str | None) -> float:
-    """A limit of the URDF; 0 where it has none that can be used."""
-    try:
-        value = float(text or 0.0)
-    except ValueError:
-        return 0.0
-    return value if 0 < value < 1e9 else 0.0
 
 
 def _unit(unit: str, linear: bool) -> str:

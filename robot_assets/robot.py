@@ -14,10 +14,15 @@ from typing import Any
 import numpy as np
 
 from robot_assets.errors import DataError
-from robot_assets.urdf import read_urdf
-from robot_assets.values import exists, number, read_toml, show, subtable, tables, text, vector
+from robot_assets.urdf import Description, read_urdf
+from robot_assets.values import MISSING, exists, number, read_toml, show, subtable, tables, text, vector
 
 ASSETS = Path(__file__).parent
+# Guesses of what a robot.toml may leave out; by whether a joint is linear.
+WINDUP = 1 / 150  # rad: how far a gear winds up under the torque limit
+VELOCITY = {False: np.pi, True: 1.0}  # velocity limit where the URDF has none, rad/s or m/s
+ENCODER = {False: 3e-6, True: 1e-6}  # position noise, rad or m
+NOISE = 1e-4  # torque noise over the torque limit
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,8 @@ class Joint:
         motor_inertia: kg m2. stiffness: N m/rad. damping, viscous_friction: N m s/rad.
         torque_limit: N m. velocity_limit: rad/s. q_std: encoder noise, rad. tau_std: N m.
 
-    A linear joint has kg, N and m in the place of kg m2, N m and rad.
+    A linear joint has kg, N and m in the place of kg m2, N m and rad. Limits that ``robot.toml`` does not give are those
+    of the URDF, else guesses, as is noise.
     """
 
     name: str
@@ -119,7 +125,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     data = read_toml(path, "robot")
     urdf, mesh_dir = _urdf(data.get("urdf"), folder, where)
     tree = read_urdf(urdf)
-    joints = tuple(_joint(entry, i, where) for i, entry in enumerate(tables(data, "joint", where)))
+    joints = tuple(_joint(entry, i, where, tree) for i, entry in enumerate(tables(data, "joint", where)))
     if not joints:
         raise DataError("[[joint]]", where, "none", "at least one driven joint")
     names = [j.name for j in joints]
@@ -130,7 +136,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
             raise DataError("joint", where, name, f"a movable joint of {urdf.name}: {sorted(tree.limits)}")
     hinges = tuple(_elasticity(e, where, names) for e in tables(data, "elasticity", where))
     _distinct([h.name for h in hinges], "[[elasticity]] names", where)
-    payload_link = data.get("payload_link", "")
+    payload_link = data.get("payload_link", tree.child[names[-1]])
     if not isinstance(payload_link, str) or (payload_link and payload_link not in tree.links):
         raise DataError("payload_link", where, show(payload_link), f"a link of {urdf.name}")
     gx, gy, gz = vector(data.get("gravity", [0, 0, -9.81]), "gravity", where, 3)
@@ -179,6 +185,8 @@ def _folder(name_or_path: str | Path, relative_to: Path | None) -> Path:
 
 
 def _urdf(entry: Any, folder: Path, where: str) -> tuple[Path, Path | None]:
+    if isinstance(entry, str):
+        entry = {"file": entry}
     if not isinstance(entry, dict):
         raise DataError("[urdf]", where, show(entry), 'a table with file = "..."')
     file = text(entry, "file", where)
@@ -199,10 +207,27 @@ def _distinct(names: list[str], what: str, where: str) -> None:
         raise DataError(what, where, f"{double[0]} twice", "distinct names")
 
 
-def _joint(entry: dict, i: int, where: str) -> Joint:
+def _joint(entry: dict, i: int, where: str, tree: Description) -> Joint:
     name = text(entry, "name", f"{where} joint {i + 1}")
-    fields = [f for f in Joint.__dataclass_fields__ if f != "name"]
-    return Joint(name, **{f: number(entry, f, f"{where} joint {name}", low=0.0, above=True) for f in fields})
+    where, linear = f"{where} joint {name}", tree.kinds.get(name) == "prismatic"
+
+    def figure(key: str, default: Any = MISSING) -> float:
+        return number(entry, key, where, low=0.0, above=True, default=default)
+
+    stiffness = figure("stiffness")
+    torque_limit = figure("torque_limit", tree.efforts.get(name) or WINDUP * stiffness)
+    return Joint(
+        name=name,
+        gear_ratio=figure("gear_ratio"),
+        motor_inertia=figure("motor_inertia"),
+        stiffness=stiffness,
+        damping=figure("damping"),
+        viscous_friction=figure("viscous_friction"),
+        torque_limit=torque_limit,
+        velocity_limit=figure("velocity_limit", tree.speeds.get(name) or VELOCITY[linear]),
+        q_std=figure("q_std", ENCODER[linear]),
+        tau_std=figure("tau_std", NOISE * torque_limit),
+    )
 
 
 def _elasticity(entry: dict, where: str, joints: list[str]) -> Elasticity:

@@ -31,6 +31,8 @@ class Description:
         links: names. limits: movable joint -> lower and upper position, rad or m.
         child: joint -> the link it carries. kinds: movable joint -> one of ``MOVABLE``.
         axes: movable joint -> its axis in its own frame, of length one.
+        efforts, speeds: movable joint -> limit of its torque, N m or N, and of its velocity; 0 where it says none that
+            can be used.
     """
 
     links: frozenset[str]
@@ -38,6 +40,8 @@ class Description:
     child: dict[str, str]
     kinds: dict[str, str]
     axes: dict[str, tuple[float, float, float]]
+    efforts: dict[str, float]
+    speeds: dict[str, float]
 
 
 def read_urdf(path: Path) -> Description:
@@ -88,7 +92,21 @@ def read_urdf(path: Path) -> Description:
     _check_mimics(joints, path)
     for element, link in zip(root.findall("link"), links, strict=True):
         _check_inertial(element.find("inertial"), link, path)
-    return Description(frozenset(links), limits, child, kinds, axes)
+    movable = [(name, joint.find("limit")) for name, joint in joints if name in limits]
+    efforts, speeds = (
+        {name: 0.0 if limit is None else _positive(limit.get(key)) for name, limit in movable}
+        for key in ("effort", "velocity")
+    )
+    return Description(frozenset(links), limits, child, kinds, axes, efforts, speeds)
+
+
+def _positive(text: str | None) -> float:
+    """A limit; 0 where there is none that can be used."""
+    try:
+        value = float(text or 0.0)
+    except ValueError:
+        return 0.0
+    return value if 0 < value < 1e9 else 0.0
 
 
 def _root(path: Path) -> ET.Element:

@@ -13,7 +13,7 @@ from ident.plan import Plan, make_plan
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 from sim.loop import Controller, Noise, failed, run_loop
-from sim.plant import DRIVE_FIELDS, Plant, build_plant, gravity_torque, link_inertia_diagonal, rest
+from sim.plant import DRIVE_FIELDS, Plant, build_plant, gravity_torque, link_inertia_diagonal, rest, time_step
 
 DAMPING_RATIO = 0.7
 PROCESS_SHARE = 0.5  # of the torque noise that really acts on the motor, in units of tau_std
@@ -50,7 +50,7 @@ def run_experiment(
     seed: int = 0,
     drives: dict[str, np.ndarray] | None = None,
     noise: float = 1.0,
-    timestep: float = 2.5e-4,
+    timestep: float | None = None,
     integrator: str = "RK4",
     link_encoders: bool = False,
     name: str = "experiment",
@@ -62,14 +62,13 @@ def run_experiment(
         effects: what is hidden in the plant.
         drives: true drive figures; nominal where None.
         noise: factor on the noise of ``robot.toml``.
-        timestep: s, of MuJoCo; a whole fraction of the sample time.
+        timestep: s, of MuJoCo; a whole fraction of the sample time. ``time_step`` of the arm where None.
 
     Raises:
         DataError: where the loop diverges, or the step does not divide the sample time.
     """
-    check_step(timestep, plan.excitation.sample_rate)
     rng = np.random.default_rng(seed)
-    plant = build_plant(plan.robot, effects, drives=drives, timestep=timestep, integrator=integrator)
+    plant = plant_for(plan, effects, drives, timestep, integrator)
     levels = noise_levels(plan.robot, noise)
     segments: list[Segment] = []
     share = len(plan.experiments) / max(len(plan.experiments) + len(plan.trajectories), 1)
@@ -101,6 +100,22 @@ def as_dataset(plan: Plan, segments: Sequence[Segment], name: str) -> Dataset:
         controller={"type": "pid"},
         segments=tuple(segments),
     )
+
+
+def plant_for(
+    plan: Plan, effects: Sequence, drives: dict[str, np.ndarray] | None, timestep: float | None, integrator: str
+) -> Plant:
+    """The plant of a plan, with a step that suits it where none is given.
+
+    Raises:
+        DataError: where a given step does not divide the sample time.
+    """
+    rate = plan.excitation.sample_rate
+    if timestep is not None:
+        check_step(timestep, rate)
+    plant = build_plant(plan.robot, effects, drives=drives, integrator=integrator)
+    plant.model.opt.timestep = time_step(plant, rate) if timestep is None else timestep
+    return plant
 
 
 def check_step(timestep: float, sample_rate: float) -> None:

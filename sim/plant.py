@@ -24,6 +24,8 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 REST_STEPS = 100
+SHORTEST_STEP, LONGEST_STEP = 1e-5, 2.5e-4  # s, about
+RESOLVED = 1.0  # rad, phase of the fastest mode in a step: Runge-Kutta is unstable from 2.8 on
 DRIVE_FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
 
@@ -150,6 +152,32 @@ def _hinges(robot: Robot, effects: Sequence) -> list[Elasticity]:
 
 def _parallel(a: Sequence[float], b: Sequence[float]) -> bool:
     return float(np.linalg.norm(np.cross(a, b))) < 1e-6 * float(np.linalg.norm(a) * np.linalg.norm(b))
+
+
+@without_engine_log
+def fastest_rate(plant: Plant) -> float:
+    """Magnitude of the fastest eigenvalue of the arm at its zero position, springs and dampers linear, rad/s; infinite
+    where it has none."""
+    model, data, nv = plant.model, mujoco.MjData(plant.model), plant.model.nv
+    mujoco.mj_forward(model, data)
+    M = np.zeros((nv, nv))
+    mujoco.mj_fullM(model, data, M)
+    along = np.zeros((model.ntendon, nv))
+    for j in range(plant.robot.n):
+        along[plant.tendon(j), [plant.motor[j], plant.link[j]]] = 1.0, -1.0
+    K = along.T * model.tendon_stiffness @ along + np.diag(model.jnt_stiffness)
+    D = along.T * model.tendon_damping @ along + np.diag(model.dof_damping)
+    try:
+        forces = np.linalg.solve(M, np.hstack([K, D]))
+        return float(np.abs(np.linalg.eigvals(np.block([[np.zeros((nv, nv)), np.eye(nv)], [-forces]]))).max())
+    except np.linalg.LinAlgError:  # huge figures
+        return np.inf
+
+
+def time_step(plant: Plant, sample_rate: float) -> float:
+    """Step of the integration that suits an arm, a whole fraction of the sample time, s."""
+    rate = np.clip(fastest_rate(plant) / RESOLVED, 1.0 / LONGEST_STEP, 1.0 / SHORTEST_STEP)  # steps a second, at least
+    return 1.0 / (sample_rate * float(np.ceil(rate / sample_rate - 1e-9)))
 
 
 def link_inertia_diagonal(plant: Plant, q: np.ndarray) -> np.ndarray:

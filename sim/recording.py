@@ -9,9 +9,9 @@ import numpy as np
 from ident.dataset import Dataset, Segment
 from ident.plan import Schedule
 from robot_assets.errors import DataError
-from sim.experiment import as_dataset, check_step, loop_gains, noise_levels
+from sim.experiment import as_dataset, loop_gains, noise_levels, plant_for
 from sim.loop import Controller, failed, run_loop
-from sim.plant import Plant, build_plant, link_inertia_diagonal, rest
+from sim.plant import Plant, link_inertia_diagonal, rest
 
 KNOT = 50  # samples between postures at which gains and holding torque are computed
 
@@ -23,7 +23,7 @@ def run_recording(
     seed: int = 0,
     drives: dict[str, np.ndarray] | None = None,
     noise: float = 1.0,
-    timestep: float = 2.5e-4,
+    timestep: float | None = None,
     integrator: str = "RK4",
     link_encoders: bool = False,
     name: str = "recording",
@@ -45,8 +45,7 @@ def run_recording(
     """
     plan = schedule.plan
     rate = plan.excitation.sample_rate
-    check_step(timestep, rate)
-    plant = build_plant(plan.robot, effects, drives=drives, timestep=timestep, integrator=integrator)
+    plant = plant_for(plan, effects, drives, timestep, integrator)
     qpos, _ = rest(plant, schedule.q_ref[0])
     q_ref, r = schedule.q_ref[None], schedule.r[None]
     by_torque = plan.injection == "torque"

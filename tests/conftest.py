@@ -34,6 +34,11 @@ def small_plan(
     )
 
 
+def quick_experiment(plan, effects=(), **kwargs):
+    """``run_experiment`` in half as many steps: for an arm alone the error is still within a hundredth of its noise."""
+    return run_experiment(plan, effects, **{"timestep": 5e-4, **kwargs})
+
+
 def through_postures(rng, n, rate, seconds):
     """Times, and positions, velocities and accelerations of a motion through many postures, of five lines from 0.1 Hz
     on."""
@@ -61,7 +66,7 @@ def ur10():
 def clean(ur10, tmp_path_factory):
     """(dataset read from files, true drives): nothing hidden, drives off by up to two."""
     drives = draw_drives(np.random.default_rng(5), ur10)
-    data = run_experiment(small_plan(ur10, 5, trajectory=True), seed=5, drives=drives)
+    data = quick_experiment(small_plan(ur10, 5, trajectory=True), seed=5, drives=drives)
     return through_files(data, tmp_path_factory.mktemp("clean")), drives
 
 

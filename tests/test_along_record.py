@@ -22,8 +22,8 @@ from ident.strong import simulated
 from ident.torque_fit import fit
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
-from sim import parse_effect, run_experiment
-from tests.conftest import small_plan, through_files
+from sim import parse_effect
+from tests.conftest import quick_experiment, small_plan, through_files
 
 LAWS = {
     kernels.CUBIC: (2e6, 0.0),
@@ -39,7 +39,7 @@ def rattling(tmp_path_factory):
     """(problem, true model without the gap, hypothesis, gap): an axis without gravity in a dead band."""
     ur10, gap = load_robot("ur10"), 8e-4
     plan = small_plan(ur10, 4)
-    data = run_experiment(plan, [parse_effect(f"backlash@shoulder_pan_joint:gap={gap}", ur10)], seed=4)
+    data = quick_experiment(plan, [parse_effect(f"backlash@shoulder_pan_joint:gap={gap}", ur10)], seed=4)
     problem = set_up(through_files(data, tmp_path_factory.mktemp("rattling"))).problem
     backlash = next(h for h in catalogue(problem.structure) if h.key == ("backlash", "shoulder_pan_joint"))
     return problem, Model(problem.structure, problem.nominal), backlash, gap
@@ -161,7 +161,7 @@ def test_a_gear_with_one_steady_motion_ends_as_a_loop(tmp_path, cubic):
     """A hardening spring is simulated in the end, one that bends its resonance over too."""
     ur10 = load_robot("ur10")
     hidden = [parse_effect(f"hardening_stiffness@elbow_joint:cubic={cubic}", ur10)]
-    problem = set_up(through_files(run_experiment(small_plan(ur10, 8), hidden, seed=8), tmp_path)).problem
+    problem = set_up(through_files(quick_experiment(small_plan(ur10, 8), hidden, seed=8), tmp_path)).problem
     h = along_record(next(h for h in catalogue(problem.structure) if h.key == ("hardening_stiffness", "elbow_joint")))
     start = Model(problem.structure, problem.nominal, (Effect(h, np.array([0.7 * cubic])),))
     along = fit(problem, start, iterations=15)

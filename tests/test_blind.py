@@ -7,10 +7,10 @@ import pytest
 
 from ident.diagnosis import diagnose, diagnose_fully
 from ident.verdict import UNKNOWN
-from sim import draw_effect, run_experiment
+from sim import draw_effect
 from sim.effects import parameters_of
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 STRENGTH = {"coulomb_friction": 0.4, "hardening_stiffness": 4.0}  # seen, and the joint still slips
 CASES = {
@@ -28,7 +28,7 @@ def hide(robot, name, seed, folder):
     rng = np.random.default_rng(seed)
     effect = draw_effect(rng, robot, names=(name,), strength=STRENGTH.get(name, 2.0))
     plan = small_plan(robot, seed, levels=(1.0,), period=1000)
-    data = run_experiment(plan, [effect], seed=seed, drives=draw_drives(rng, robot), timestep=5e-4)
+    data = quick_experiment(plan, [effect], seed=seed, drives=draw_drives(rng, robot))
     return effect, through_files(data, folder)
 
 
@@ -68,7 +68,7 @@ def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path, power, coe
             return drag
 
     drives = draw_drives(np.random.default_rng(3), ur10)
-    data = run_experiment(small_plan(ur10, 3, levels=(1.0,)), [Drag("elbow_joint")], seed=3, drives=drives)
+    data = quick_experiment(small_plan(ur10, 3, levels=(1.0,)), [Drag("elbow_joint")], seed=3, drives=drives)
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
     assert verdict.unexplained_verdict == "unknown cause remains"
@@ -94,7 +94,7 @@ def test_a_torque_constant_that_falls_with_time_gets_no_name(ur10, tmp_path):
             return delivered
 
     drives = draw_drives(np.random.default_rng(12), ur10)
-    data = run_experiment(small_plan(ur10, 12), [Warming("elbow_joint", 0.06, 100.0)], seed=12, drives=drives)
+    data = quick_experiment(small_plan(ur10, 12), [Warming("elbow_joint", 0.06, 100.0)], seed=12, drives=drives)
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
     assert verdict.unexplained_verdict == "unknown cause remains"
@@ -108,7 +108,7 @@ def test_friction_of_every_joint_counts_once(ur10, tmp_path):
 
     truth = {"shoulder_pan_joint": 4.0, "elbow_joint": 3.0, "wrist_1_joint": 1.5, "wrist_2_joint": 1.2}
     hidden = [parse_effect(f"coulomb_friction@{j}:torque={t}", ur10) for j, t in truth.items()]
-    data = run_experiment(small_plan(ur10, 6), hidden, seed=6, drives=draw_drives(np.random.default_rng(6), ur10))
+    data = quick_experiment(small_plan(ur10, 6), hidden, seed=6, drives=draw_drives(np.random.default_rng(6), ur10))
     verdict = diagnose(through_files(data, tmp_path), max_causes=1)
     found = {c.joint: c for c in verdict.causes if c.probability > 0.5}
     assert set(found) == set(truth) and all(c.effect == "coulomb_friction" for c in found.values())
@@ -147,7 +147,7 @@ def test_a_cable_that_gives_before_it_slips_is_named_with_its_friction(ur10, tmp
 
     drives = draw_drives(np.random.default_rng(8), ur10)
     cable = YieldingCable("wrist_1_joint", 20.0, 1.0, 2e-3)
-    data = run_experiment(small_plan(ur10, 8), [cable], seed=8, drives=drives)
+    data = quick_experiment(small_plan(ur10, 8), [cable], seed=8, drives=drives)
     (cause,) = diagnose(through_files(data, tmp_path)).causes
     assert (cause.effect, cause.joint) == ("dress_pack", "wrist_1_joint") and cause.probability > 0.9
     assert cause.parameters["stiffness"].value == pytest.approx(20.0, rel=0.02)
@@ -174,7 +174,7 @@ def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
             spec.joint(f"link:{self.place}").damping = [coefficient, 0, 0]
 
     drives = draw_drives(np.random.default_rng(5), ur10)
-    data = run_experiment(
+    data = quick_experiment(
         small_plan(ur10, 5, points=1, levels=(1.0,), period=1000), [LinkFriction("elbow_joint")], seed=5, drives=drives
     )
     result = diagnose_fully(through_files(data, tmp_path))
@@ -194,7 +194,7 @@ def test_a_base_that_leans_is_no_cause_of_the_catalogue(ur10, tmp_path):
     """By two degrees: every joint that bears gravity asks for something, and no name explains that."""
     plan = small_plan(ur10, 12, levels=(1.0,), period=1000)
     arm = replace(ur10, gravity=(9.81 * np.sin(0.03), 9.81 * np.sin(0.02), -9.81))
-    data = run_experiment(replace(plan, robot=arm), [], seed=12, timestep=5e-4)
+    data = quick_experiment(replace(plan, robot=arm), [], seed=12)
     result = diagnose_fully(through_files(replace(data, robot=ur10), tmp_path))
     assert not result.verdict.causes and result.verdict.unexplained_verdict == UNKNOWN
     assert result.candidates[0][0][:2] == ("unknown:leaning_base", "base")

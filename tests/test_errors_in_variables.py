@@ -19,9 +19,8 @@ from ident.problem import predictions
 from ident.refits import refit
 from ident.torque_fit import fit
 from ident.weights import make_weights
-from sim import run_experiment
 from sim.experiment import draw_drives
-from tests.conftest import small_plan
+from tests.conftest import quick_experiment, small_plan
 
 STEP = 1e-5
 
@@ -55,9 +54,7 @@ def test_the_slope_of_what_noise_adds_is_its_derivative(identified, named):
 def noisy(ur10):
     """(problem, true parameters) at ten times the noise of the arm."""
     drives = draw_drives(np.random.default_rng(6), ur10)
-    problem = set_up(
-        run_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0, timestep=5e-4)
-    ).problem
+    problem = set_up(quick_experiment(small_plan(ur10, 6, periods=4), seed=6, drives=drives, noise=10.0)).problem
     names = {"stiffness": "stiffness", "damping": "damping", "inertia": "motor_inertia", "viscous": "viscous_friction"}
     return problem, replace(problem.nominal, **{mine: drives[its] for mine, its in names.items()})
 
@@ -83,7 +80,7 @@ def test_noise_of_the_position_moves_no_parameter(noisy, monkeypatch):
 def test_noise_of_the_position_moves_no_parameter_in_a_single_period(ur10, monkeypatch):
     """The same where the end of a transient alone tells of the noise."""
     drives = draw_drives(np.random.default_rng(6), ur10)
-    data = run_experiment(small_plan(ur10, 6, periods=2), seed=6, drives=drives, noise=10.0)
+    data = quick_experiment(small_plan(ur10, 6, periods=2), seed=6, drives=drives, noise=10.0)
     data = replace(data, q_std=None, tau_std=None)
     names = ("stiffness", "damping", "motor_inertia", "viscous_friction")
     truth = np.log(np.concatenate([drives[name] for name in names]))

@@ -56,8 +56,8 @@ from ident.verdict import UNKNOWN, Cause, Gain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
-from sim import parse_effect, run_experiment
-from tests.conftest import small_plan, through_files
+from sim import parse_effect
+from tests.conftest import quick_experiment, small_plan, through_files
 
 
 def candidate(h, p, information, cost=1000.0):
@@ -529,7 +529,7 @@ def test_a_step_that_is_cut_to_lead_uphill_does_not_end_a_fit(ur10, named):
     """Beside a loop, of a hinge that is begun too stiff and turned: parts of the step are cut, and what is left
     rises."""
     plan = small_plan(ur10, 1, points=1, levels=(1.0,), validation_points=0)
-    setup, result = identify(run_experiment(plan, [], seed=1, timestep=5e-4))
+    setup, result = identify(quick_experiment(plan, [], seed=1))
     problem = setup.problem
     hinge = next(
         h
@@ -680,7 +680,7 @@ def test_a_motor_that_creeps_in_its_friction_is_no_drive_that_saturates(tmp_path
     """A limit near zero would deliver nothing, and so explain a motor that hardly moves."""
     robot = load_robot("twomass")
     hidden = parse_effect("coulomb_friction@drive:torque=0.1", robot)
-    data = run_experiment(small_plan(robot, 4, period=1000), [hidden], seed=4)
+    data = quick_experiment(small_plan(robot, 4, period=1000), [hidden], seed=4)
     verdict = diagnose(through_files(data, tmp_path))
     assert verdict.discrepancy.detected
     assert all(c.probability < 0.5 for c in verdict.causes if c.effect != "coulomb_friction")
@@ -688,7 +688,7 @@ def test_a_motor_that_creeps_in_its_friction_is_no_drive_that_saturates(tmp_path
 
 def test_a_motor_that_friction_holds_altogether_is_said_not_to_move(tmp_path):
     robot = load_robot("twomass")
-    data = run_experiment(
+    data = quick_experiment(
         small_plan(robot, 4, period=1000), [parse_effect("coulomb_friction@drive:torque=0.3", robot)], seed=4
     )
     with pytest.raises(DataError, match="no joint that moves"):
@@ -1036,7 +1036,7 @@ def test_a_search_tries_other_bodies_where_one_answers_best(ur10, named, tmp_pat
     """Of the links that could make up for a wrist that is too heavy more than two are refitted."""
     heavy = parse_effect("link_inertia@wrist_1_link:mass=1.2", ur10)
     plan = small_plan(ur10, 3, points=2, levels=(1.0,), validation_points=0)
-    setup, result = identify(through_files(run_experiment(plan, [heavy], seed=3), tmp_path))
+    setup, result = identify(through_files(quick_experiment(plan, [heavy], seed=3), tmp_path))
     bodies, told = [h for h in named.values() if "body" in h.options], []
     explore(setup.problem, result, bodies, 0.0, np.inf, Workers(progress=told.append))
     assert sum("refit: link_inertia" in text for text in told) > PER_EFFECT
@@ -1188,7 +1188,7 @@ def test_a_search_for_a_motion_that_does_not_repeat_is_given_up(ratio, expected)
 def test_an_effect_that_the_data_need_stays_and_a_companion_that_they_do_not_goes(ur10, tmp_path):
     """A friction at another joint, found with that of this one before a later cause, made up for what was missing."""
     hidden = parse_effect("coulomb_friction@elbow_joint:torque=5", ur10)
-    data = through_files(run_experiment(small_plan(ur10, 8, points=1, levels=(1.0,)), [hidden], seed=8), tmp_path)
+    data = through_files(quick_experiment(small_plan(ur10, 8, points=1, levels=(1.0,)), [hidden], seed=8), tmp_path)
     setup, result = identify(data)
     rub = {h.key: h for h in catalogue(setup.problem.structure)}["coulomb_friction", "elbow_joint"]
     model = replace(result.model, effects=(Effect(rub, np.array([3.0, 0.0, 1e-3])),))

@@ -23,9 +23,9 @@ from ident.rounds import Round, temper_of, told_share, weighed_round
 from ident.search import hopeful
 from ident.trust import denied
 from ident.verdict import UNKNOWN
-from sim import parse_effect, run_experiment
+from sim import parse_effect
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 COGGING = "cogging@wrist_3_joint:amplitude=0.002,periods_per_rev=202,phase=0.3"
 COULOMB = "coulomb_friction@wrist_2_joint:torque=0.004"
@@ -47,12 +47,11 @@ def hypotheses(identified):
 def test_an_effect_within_the_error_of_the_noise_is_found(ur10, tmp_path, faint, beside):
     """Alone, and beside another one that is not faint."""
     effects = [parse_effect(text, ur10) for text in (*beside, faint)]
-    data = run_experiment(
+    data = quick_experiment(
         small_plan(ur10, 31, levels=(1.0,)),
         effects,
         seed=31,
         drives=draw_drives(np.random.default_rng(31), ur10),
-        timestep=5e-4,
     )
     verdict = diagnose(through_files(data, tmp_path))
     name, value = SIZES[faint]
@@ -165,12 +164,11 @@ def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside
     hidden = parse_effect("payload@flange:mass=0.5,com_x=0.02,com_y=0.03,com_z=0.08", ur10)
 
     def recorded(effects, folder):
-        data = run_experiment(
+        data = quick_experiment(
             small_plan(ur10, 5, points=1, levels=(1.0,), periods=2, validation_points=0),
             effects,
             seed=5,
             noise=0.0,
-            timestep=5e-4,
         )
         rng = np.random.default_rng(7)
 

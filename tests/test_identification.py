@@ -25,9 +25,9 @@ from ident.screening import screen
 from ident.torque_fit import SLIGHT, fit
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
-from sim import parse_effect, run_experiment
+from sim import parse_effect
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 FIELDS = ("stiffness", "damping", "motor_inertia", "viscous_friction")
 
@@ -93,7 +93,7 @@ def test_held_out_data_change_nothing_of_what_is_fitted(kind):
     show between periods."""
     robot = load_robot("twomass")
     plan = small_plan(robot, 3, points=1, levels=(10.0,), period=500, periods=2, trajectory=True)
-    data = run_experiment(plan, [], seed=3)
+    data = quick_experiment(plan, [], seed=3)
     told = tuple(s for s in data.segments if s.role == "identification") if kind == "multisine" else ()
     held_out = [s for s in data.segments if s.role == "validation"]
     if kind == "trajectory":
@@ -120,7 +120,9 @@ def test_held_out_data_change_nothing_of_what_is_fitted(kind):
 def test_what_rounding_leaves_of_records_without_noise_is_no_discrepancy():
     """Exact periods of the arm that is fitted, to the last digits but a few."""
     robot = load_robot("twomass")
-    data = run_experiment(small_plan(robot, 3, points=1, levels=(10.0,), period=500, periods=3), [], seed=3, noise=0.0)
+    data = quick_experiment(
+        small_plan(robot, 3, points=1, levels=(10.0,), period=500, periods=3), [], seed=3, noise=0.0
+    )
     problem = set_up(data).problem
     preds = predictions(problem, Model(problem.structure, problem.nominal), [None] * len(problem.groups), steps=None)
     groups = []
@@ -185,7 +187,7 @@ def test_a_ripple_that_is_fast_along_a_motion_does_not_fold_into_its_band(ur10):
     """The ripple passes at up to 40 Hz where the motion is compared below 3 Hz."""
     drives = draw_drives(np.random.default_rng(4), ur10)
     plan = small_plan(ur10, 4, points=1, levels=(1.0,), validation_points=0, trajectory=True)
-    data = run_experiment(
+    data = quick_experiment(
         plan,
         [parse_effect("cogging@elbow_joint:amplitude=4,periods_per_rev=606,phase=0.7", ur10)],
         seed=4,
@@ -213,7 +215,7 @@ def test_links_behind_gears_are_found_beside_elastic_hinges(tmp_path):
     drives."""
     irb = load_robot("irb")
     spring = parse_effect("gravity_spring@joint_2:stiffness=900,rest_angle=0.2", irb)
-    data = run_experiment(small_plan(irb, 3, levels=(0.5,), period=1000), [spring], seed=3)
+    data = quick_experiment(small_plan(irb, 3, levels=(0.5,), period=1000), [spring], seed=3)
     problem = set_up(through_files(data, tmp_path)).problem
     result = fit(problem, Model(problem.structure, problem.nominal))
     preds = predictions(problem, result.model, result.remainders)
@@ -229,7 +231,7 @@ def test_links_behind_gears_are_found_beside_elastic_hinges(tmp_path):
 @pytest.fixture(scope="module")
 def panda_problem(tmp_path_factory):
     panda = load_robot("panda")
-    data = run_experiment(small_plan(panda, 6, points=1, levels=(1.0,), validation_points=0), seed=6)
+    data = quick_experiment(small_plan(panda, 6, points=1, levels=(1.0,), validation_points=0), seed=6)
     return set_up(through_files(data, tmp_path_factory.mktemp("panda"))).problem
 
 
@@ -319,7 +321,7 @@ def test_a_common_offset_in_time_is_a_delay_where_there_is_one_joint(clean):
     """That of its drive or its sensor, if the torque is held; where nothing is said of the hold half a sample may be
     due to that."""
     robot = load_robot("twomass")
-    data = run_experiment(small_plan(robot, 4, period=500), seed=4)
+    data = quick_experiment(small_plan(robot, 4, period=500), seed=4)
     assert data.input_hold == clean[0].input_hold == "zoh"
     assert not set_up(data).problem.free_timing
     assert set_up(replace(data, input_hold="none")).problem.free_timing and set_up(clean[0]).problem.free_timing

@@ -15,10 +15,9 @@ from ident.link_sensor import LinkDelay, comparable_links, find_link_delays, wit
 from ident.model import Effect, Model
 from ident.problem import data_count, data_counts, predictions
 from ident.weights import make_weights
-from sim import run_experiment
 from sim.effects import parse_effect
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 
 def motions(robot, seed, hidden, folder):
@@ -33,7 +32,7 @@ def motions(robot, seed, hidden, folder):
     )
     drives = draw_drives(np.random.default_rng(seed), robot)
     plan = replace(plans[0], experiments=(), trajectories=moves)
-    return through_files(run_experiment(plan, hidden, seed=seed, drives=drives, link_encoders=True), folder)
+    return through_files(quick_experiment(plan, hidden, seed=seed, drives=drives, link_encoders=True), folder)
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +129,7 @@ def test_link_encoders_count_at_their_joints(still):
 
 
 def test_multisines_are_compared_without_link_encoders(ur10, tmp_path):
-    data = run_experiment(small_plan(ur10, 13, points=1, levels=(1.0,)), [], seed=13, link_encoders=True)
+    data = quick_experiment(small_plan(ur10, 13, points=1, levels=(1.0,)), [], seed=13, link_encoders=True)
     assert not comparable_links(set_up(through_files(data, tmp_path)).problem)
 
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import diagnose
-from sim import run_experiment
 from sim.effects import make_effect
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 
 @pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
@@ -15,7 +14,7 @@ def test_a_late_link_encoder_is_named_and_no_other_cause(ur10, tmp_path, seed):
     rng = np.random.default_rng(seed)
     place, delay = str(rng.choice(ur10.joint_names)), float(rng.uniform(5e-4, 4e-3))
     effect = make_effect("sensor_delay", place, delay=delay, channel="q_link")
-    data = run_experiment(
+    data = quick_experiment(
         small_plan(ur10, seed, levels=(1.0,), period=1000),
         [effect],
         seed=seed,
@@ -30,7 +29,7 @@ def test_a_late_link_encoder_is_named_and_no_other_cause(ur10, tmp_path, seed):
 
 def test_link_encoders_on_time_are_not_named(ur10, tmp_path):
     drives = draw_drives(np.random.default_rng(13), ur10)
-    data = run_experiment(
+    data = quick_experiment(
         small_plan(ur10, 13, levels=(1.0,), period=1000), [], seed=13, drives=drives, link_encoders=True
     )
     assert not diagnose(through_files(data, tmp_path)).causes

@@ -11,8 +11,7 @@ from ident.identification import set_up
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, geometric_remainder, make_plane, solve, true_position
 from ident.model import Model
 from robot_assets.robot import load_robot
-from sim import run_experiment
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 
 @pytest.mark.parametrize("share", [1.0, 0.03])
@@ -32,7 +31,7 @@ def test_links_on_lightly_damped_gears_are_solved_along_large_motions(clean, sha
 
 def test_a_single_axis_without_a_remainder_takes_one_step(tmp_path, monkeypatch):
     robot = load_robot("twomass")
-    problem = set_up(through_files(run_experiment(small_plan(robot, 4, period=1000), [], seed=4), tmp_path)).problem
+    problem = set_up(through_files(quick_experiment(small_plan(robot, 4, period=1000), [], seed=4), tmp_path)).problem
     asked = []
     plain = inverse.geometric_remainder
     monkeypatch.setattr(inverse, "geometric_remainder", lambda *args: asked.append(1) or plain(*args))

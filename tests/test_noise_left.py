@@ -22,8 +22,8 @@ from ident.parallel import Workers
 from ident.problem import predictions
 from ident.refits import reweighted
 from ident.weights import make_weights
-from sim import parse_effect, run_experiment
-from tests.conftest import small_plan, through_files
+from sim import parse_effect
+from tests.conftest import quick_experiment, small_plan, through_files
 
 
 def spectra(rng, power, records=3):
@@ -89,7 +89,7 @@ def test_what_is_alike_at_all_lines_and_joints_is_noise(lacks):
 def test_noise_that_is_given_says_nothing_of_its_colour(ur10, tmp_path, joints):
     """Single periods show no scatter. Noise whose samples go together has several times its power in the band."""
     plan = small_plan(ur10, 33, points=2, periods=2, transient_periods=1)
-    data = through_files(run_experiment(plan, seed=33), tmp_path)
+    data = through_files(quick_experiment(plan, seed=33), tmp_path)
     given = 3.0 * ur10.array("tau_std")
     rng = np.random.default_rng(8)
 
@@ -118,7 +118,7 @@ def motions(ur10, tmp_path_factory):
         replace(motion, name=name, role=role) for name, role in (("m1", "identification"), ("m2", "validation"))
     )
     hidden = parse_effect("coulomb_friction@elbow_joint:torque=0.5", ur10)
-    data = run_experiment(replace(plan, experiments=(), trajectories=named), [hidden], seed=31)
+    data = quick_experiment(replace(plan, experiments=(), trajectories=named), [hidden], seed=31)
     return replace(through_files(data, tmp_path_factory.mktemp("motions")), q_std=None, tau_std=None)
 
 
@@ -152,7 +152,7 @@ def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints
     high lines."""
     plan = small_plan(ur10, 32, points=2, periods=2, transient_periods=1)
     data = replace(
-        through_files(run_experiment(plan, seed=32), tmp_path_factory.mktemp("one")), q_std=None, tau_std=None
+        through_files(quick_experiment(plan, seed=32), tmp_path_factory.mktemp("one")), q_std=None, tau_std=None
     )
     last = [replace(s, periods=1, transient_periods=0, **s.part(slice(-s.period, None))) for s in data.segments]
     data = replace(data, segments=tuple(last))  # the transient tells it otherwise
@@ -168,7 +168,7 @@ def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tm
     """A ripple shows at lines that nothing excites as at the others; what is still left there beside it is noise."""
     plan = small_plan(ur10, 35, points=2, periods=2, transient_periods=1)
     data = replace(
-        through_files(run_experiment(plan, seed=35), tmp_path_factory.mktemp("raised")), q_std=None, tau_std=None
+        through_files(quick_experiment(plan, seed=35), tmp_path_factory.mktemp("raised")), q_std=None, tau_std=None
     )
     last = [replace(s, periods=1, transient_periods=0, **s.part(slice(-s.period, None))) for s in data.segments]
     data = replace(data, segments=tuple(last))
@@ -191,7 +191,7 @@ def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(ur10, tmp_p
     """Of all joints alike it is seen at the fast lines of motions. At one joint alone it may as well be a cause."""
     plan = small_plan(ur10, 32, points=1, trajectory=True)
     (motion,) = plan.trajectories
-    data = run_experiment(replace(plan, experiments=(), trajectories=(motion,)), seed=32)
+    data = quick_experiment(replace(plan, experiments=(), trajectories=(motion,)), seed=32)
     data = replace(through_files(data, tmp_path), q_std=None, tau_std=None)
     (segment,) = data.segments
     steps = np.random.default_rng(5).normal(size=segment.tau.shape) * 20.0 * ur10.array("tau_std")

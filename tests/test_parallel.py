@@ -18,8 +18,8 @@ from ident.torque_fit import fit
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from robot_assets.threads import thread_count
-from sim import parse_effect, run_experiment
-from tests.conftest import small_plan, through_files
+from sim import parse_effect
+from tests.conftest import quick_experiment, small_plan, through_files
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def friction(tmp_path_factory):
     """A small case with several candidates, and its verdict made on the threads of this process."""
     robot = load_robot("twomass")
     hidden = parse_effect("coulomb_friction@drive:torque=0.1", robot)
-    data = run_experiment(small_plan(robot, 4, period=1000, levels=(10.0, 4.0)), [hidden], seed=4)
+    data = quick_experiment(small_plan(robot, 4, period=1000, levels=(10.0, 4.0)), [hidden], seed=4)
     data = through_files(data, tmp_path_factory.mktemp("two"))
     return data, verdict_of(data)
 

@@ -13,13 +13,47 @@ from sim import EFFECTS, draw_effect, parse_effect, run_experiment
 from sim.effects import make_effect, parameters_of, valid_places
 from sim.effects.dry import REVERSAL, resistance, turn
 from sim.effects.effect import Dry, Run, State, carried
-from sim.plant import build_plant, gravity_torque, rest
+from sim.experiment import draw_drives
+from sim.plant import SHORTEST_STEP, build_plant, fastest_rate, gravity_torque, rest, time_step
 from tests.conftest import small_plan
 
 
 def run_of(plant):
     """A run of one simulation in steps of 0.1 ms."""
     return Run(1, 1e-4, 1e-3, plant.robot, plant.drives, plant.model, np.zeros(1))
+
+
+@pytest.mark.parametrize("hidden", [None, "backlash@shoulder_pan_joint:gap=8e-4"])
+def test_the_step_of_an_experiment_is_far_below_its_noise(ur10, hidden):
+    """Of a step a quarter as long the records differ by less than a fiftieth of the noise, at every joint."""
+    effects = [] if hidden is None else [parse_effect(hidden, ur10)]
+    plan = small_plan(ur10, 3, points=1, validation_points=0, levels=(1.0,), period=1000)
+    drives = draw_drives(np.random.default_rng(3), ur10)
+    assert time_step(build_plant(ur10, effects, drives=drives), 1000.0) == pytest.approx(2.5e-4)
+    coarse, fine = (
+        run_experiment(plan, effects, drives=drives, noise=0.0, timestep=h).segments for h in (None, 6.25e-5)
+    )
+    for a, b in zip(coarse, fine, strict=True):
+        assert np.all(np.std(a.q - b.q, axis=0) < ur10.array("q_std") / 50.0)
+        assert np.all(np.std(a.tau - b.tau, axis=0) < ur10.array("tau_std") / 50.0)
+
+
+def test_the_step_suits_the_fastest_mode_and_divides_the_sample_time(ur10):
+    """A drive alone: two inertias and a spring, in closed form; stiffer ones are stepped faster, up to a limit."""
+    bench = load_robot("twomass")
+    plant = build_plant(bench)
+    k, d, J, v = (plant.drives[x][0] for x in ("stiffness", "damping", "motor_inertia", "viscous_friction"))
+    link = build_plant(bench).model.dof_M0[plant.link[0]]
+    roots = np.roots([J * link, (J + link) * d + link * v, (J + link) * k + v * d, v * k])
+    assert fastest_rate(plant) == pytest.approx(np.abs(roots).max(), rel=1e-6)
+    assert 1.0 / (3000.0 * time_step(plant, 3000.0)) == pytest.approx(2.0)  # of 3 kHz two steps a sample
+    for rate, factor in ((250.0, 30.0), (1000.0, 100.0), (8000.0, 1000.0)):
+        stiff = build_plant(ur10, drives={"stiffness": factor * ur10.array("stiffness")})
+        step = time_step(stiff, rate)
+        assert 1.0 / (rate * step) == pytest.approx(round(1.0 / (rate * step))) and step < 2.5e-4
+        assert 0.5 < step * fastest_rate(stiff) < 1.0 + 1e-9
+    frozen = build_plant(ur10, drives={"stiffness": 1e9 * ur10.array("stiffness")})
+    assert time_step(frozen, 1000.0) == pytest.approx(SHORTEST_STEP)
 
 
 def test_rest_sags_by_torque_over_stiffness(ur10):

@@ -17,10 +17,9 @@ from ident.show.replay import equilibrium, load_arm, replay, sampled_impedance
 from ident.show.simulated_gain import export_baseline, spread
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
-from sim import run_experiment
 from sim.effects import make_effect
 from sim.experiment import plan_experiment
-from tests.conftest import through_files
+from tests.conftest import quick_experiment, through_files
 
 CLOSE = 0.1  # of the gap, as the exported model is to agree
 
@@ -37,7 +36,7 @@ def drive_data(*effects, noise=0.1, trajectory=False, validation=1):
         "trajectory": trajectory,
     }
     plan = plan_experiment(robot, postures, seed=1, **options)
-    return run_experiment(plan, effects, seed=1, noise=noise)
+    return quick_experiment(plan, effects, seed=1, noise=noise)
 
 
 def arm_data(*effects):
@@ -45,7 +44,7 @@ def arm_data(*effects):
     robot = load_robot("ur10")
     postures = operating_points(robot, 2, np.random.default_rng(2))
     options = {"points": 1, "validation_points": 1, "levels": (1.0,), "period": 2000, "trajectory": False}
-    return run_experiment(plan_experiment(robot, postures, seed=2, **options), effects, seed=2)
+    return quick_experiment(plan_experiment(robot, postures, seed=2, **options), effects, seed=2)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +56,7 @@ def test_the_impedance_of_the_file_is_that_of_the_model():
     """Differences of integration steps against the matrices of the gray-box, images of the hold apart."""
     robot = load_robot("ur10")
     posture = operating_points(robot, 1, np.random.default_rng(0))
-    data = run_experiment(
+    data = quick_experiment(
         plan_experiment(robot, posture, points=1, validation_points=0, levels=(1.0,), period=500, trajectory=False)
     )
     setup = set_up(data)

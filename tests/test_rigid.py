@@ -31,9 +31,9 @@ from ident.rounds import left_share
 from ident.torque_fit import fit
 from ident.trust import too_fast
 from robot_assets.robot import Elasticity, load_robot
-from sim import parse_effect, run_experiment
+from sim import parse_effect
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files, through_postures
+from tests.conftest import quick_experiment, small_plan, through_files, through_postures
 
 RATE = 250.0
 CHANGED = {
@@ -293,7 +293,7 @@ def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
     drives = draw_drives(np.random.default_rng(2), ur10)
     plans = [replace(small_plan(ur10, seed, points=1, trajectory=True), experiments=()) for seed in (21, 22)]
     parts = [
-        run_experiment(plan, [hidden], seed=seed, drives=drives) for plan, seed in zip(plans, (21, 22), strict=True)
+        quick_experiment(plan, [hidden], seed=seed, drives=drives) for plan, seed in zip(plans, (21, 22), strict=True)
     ]
     roles = ("identification", "validation")
     motions = [replace(d.segments[0], name=f"m{i}", role=r) for i, (d, r) in enumerate(zip(parts, roles, strict=True))]

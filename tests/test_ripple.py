@@ -12,11 +12,11 @@ from ident.hypotheses import catalogue
 from ident.hypotheses.ripple import ripple
 from ident.problem import predictions
 from ident.screening import Score, other_waves
-from sim import parse_effect, run_experiment
+from sim import parse_effect
 from sim.effects.effect import Torque
 from sim.effects.transmission import carried
 from sim.experiment import draw_drives
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 sizes = st.floats(-0.6, 0.6)
 
@@ -109,9 +109,7 @@ def test_a_ripple_with_a_second_harmonic_is_one_cause(ur10, tmp_path, name):
     size = {"cogging": 6.0, "transmission_error": 5e-5}[name]
     effects = uneven_motor(ur10, size) if name == "cogging" else [UnevenGear("elbow_joint", size, 202.0, 0.2)]
     drives = draw_drives(np.random.default_rng(8), ur10)
-    data = run_experiment(
-        small_plan(ur10, 8, points=1, levels=(1.0,), period=1000), effects, seed=8, drives=drives, timestep=5e-4
-    )
+    data = quick_experiment(small_plan(ur10, 8, points=1, levels=(1.0,), period=1000), effects, seed=8, drives=drives)
     verdict = diagnose(through_files(data, tmp_path))
     assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.1] == [(name, "elbow_joint")]
     found = verdict.causes[0].parameters

@@ -39,6 +39,28 @@ def test_a_wrong_robot_is_one_clear_error(tmp_path, ur10, old, new, found):
     assert found in str(caught.value) and "robot.toml" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_what_a_robot_may_leave_out_is_of_its_urdf_or_guessed(tmp_path):
+    """Limits, noise and the link that bears a payload; a path alone for the URDF."""
+    limits = ('<limit lower="-1" upper="1" effort="40" velocity="3"/>', '<limit lower="0" upper="0.2"/>')
+    kinds = ("revolute", "prismatic")
+    joints = "".join(
+        f'<joint name="j{i}" type="{k}"><parent link="l{i}"/><child link="l{i + 1}"/><axis xyz="0 0 1"/>{limit}</joint>'
+        for i, (k, limit) in enumerate(zip(kinds, limits, strict=True))
+    )
+    links = "".join(f'<link name="l{i}"/>' for i in range(3))
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    drive = "gear_ratio = 100\nmotor_inertia = 0.5\nstiffness = 1.5e4\ndamping = 3.0\nviscous_friction = 2.0\n"
+    (tmp_path / "robot.toml").write_text(
+        'urdf = "arm.urdf"\n' + "".join(f'[[joint]]\nname = "j{i}"\n{drive}' for i in range(2))
+    )
+    robot = load_robot(tmp_path)
+    assert robot.array("torque_limit") == pytest.approx([40.0, 100.0])
+    assert robot.array("velocity_limit") == pytest.approx([3.0, 1.0])
+    assert robot.array("q_std") == pytest.approx([3e-6, 1e-6])
+    assert robot.array("tau_std") == pytest.approx([4e-3, 1e-2])
+    assert robot.payload_link == "l2"
+
+
 def test_an_unknown_robot_lists_the_known_ones():
     with pytest.raises(DataError, match="ur10"):
         load_robot("no-such-arm")

@@ -10,8 +10,7 @@ from ident.identification import identify
 from ident.problem import predictions
 from ident.tones import find_tones
 from robot_assets.robot import load_robot
-from sim import run_experiment
-from tests.conftest import small_plan, through_files
+from tests.conftest import quick_experiment, small_plan, through_files
 
 
 def tones(problem, fit):
@@ -52,14 +51,14 @@ def test_a_tone_that_repeats_with_the_period_is_no_scatter(clean):
 
 def test_records_without_noise_hold_no_tone():
     robot = load_robot("twomass")
-    setup, fit = identify(run_experiment(small_plan(robot, 3, period=1000, levels=(4.0,)), [], seed=3, noise=0.0))
+    setup, fit = identify(quick_experiment(small_plan(robot, 3, period=1000, levels=(4.0,)), [], seed=3, noise=0.0))
     assert not tones(setup.problem, fit)
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.02])
 def test_what_shakes_a_drive_at_its_own_frequency_is_an_unknown_cause(tmp_path, amplitude):
     robot = load_robot("twomass")
-    data = run_experiment(small_plan(robot, 3, period=1000, levels=(4.0,)), [], seed=3)
+    data = quick_experiment(small_plan(robot, 3, period=1000, levels=(4.0,)), [], seed=3)
     verdict = diagnose(through_files(with_tone(data, 0, 21.3, amplitude), tmp_path))
     assert not verdict.causes
     assert verdict.discrepancy.detected == bool(amplitude)

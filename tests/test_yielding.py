@@ -14,8 +14,8 @@ from ident.hypotheses.friction import presliding_friction
 from ident.hypotheses.yielding import SLIP, along_path, bristle, elastoplastic, yielded, yielding_point
 from ident.identification import set_up
 from ident.model import Effect, Model
-from sim import parse_effect, run_experiment
-from tests.conftest import small_plan, through_files
+from sim import parse_effect
+from tests.conftest import quick_experiment, small_plan, through_files
 
 STIFFNESS, LIMIT = 80.0, 0.2
 EXPONENTS = [(1.0, 0.0), (1.0, 1.0), (2.0, 0.5), (4.0, 1.2), (12.0, 0.0)]
@@ -138,7 +138,7 @@ def test_the_record_says_what_friction_holds_where_a_motion_begins(ur10, tmp_pat
     """The motion that closes a recording was not made, and leaves nothing in the bristles."""
     hidden = parse_effect("presliding_friction@elbow_joint:stiffness=2000,coulomb=8", ur10)
     plan = small_plan(ur10, 3, points=1, levels=(1.0,), trajectory=True)
-    setup = set_up(through_files(run_experiment(plan, [hidden], seed=3), tmp_path))
+    setup = set_up(through_files(quick_experiment(plan, [hidden], seed=3), tmp_path))
     problem = setup.problem
     (group,) = (g for g in (*problem.groups, *setup.held_out) if g.window is not None)
     law = next(h for h in catalogue(problem.structure) if h.key == ("presliding_friction", "elbow_joint"))

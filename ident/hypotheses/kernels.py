@@ -191,7 +191,7 @@ def along_deflection(
     """
     if code == HYSTERESIS:
         return along_path(np.diff(x, axis=1, prepend=x[:, -1:]), a, b, exponent, recoil)
-    return _moved_to_mean(code, a, b, k, x, mean, bisections)
+    return _moved_to_mean(code, a, b, k, x, np.ascontiguousarray(mean), bisections)
 
 
 @njit(cache=True, nogil=True)

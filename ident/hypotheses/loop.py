@@ -66,8 +66,9 @@ def steady_loop(
         past = [*past[-MEMORY:], (start.T, move.T)]
         if not np.all(moving):
             out[:, left[~moving]] = part[:, ~moving]
-            left, part, memory = left[moving], part[:, moving], memory[:, moving]
-            linear, rate = linear[:, moving], rate[:, moving]
+            left = left[moving]
+            # The compiled code steps all records of a time side by side, and is compiled once for all layouts.
+            part, memory, linear, rate = (np.ascontiguousarray(x[:, moving]) for x in (part, memory, linear, rate))
             past = [(z[moving], f[moving]) for z, f in past]
         if not len(left):
             break

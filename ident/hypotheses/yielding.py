@@ -48,7 +48,7 @@ def bristle(
 def along_path(steps: np.ndarray, stiffness: float, limit: float, exponent: float, recoil: float) -> np.ndarray:
     """Torque of an element that yields along the steps (S, T) of one period, after one period before it."""
     before = onward(steps, stiffness, limit, exponent, recoil, np.zeros(len(steps)))
-    return onward(steps, stiffness, limit, exponent, recoil, before[:, -1])
+    return onward(steps, stiffness, limit, exponent, recoil, before[:, -1].copy())
 
 
 @njit(cache=True, nogil=True)

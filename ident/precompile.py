@@ -1,0 +1,31 @@
+"""Compiled code made once, after the installation: ``python -m ident.precompile``.
+
+Else the first diagnosis makes it, which takes some twenty seconds longer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.chain import build_structure
+from ident.hypotheses.friction import direction
+from ident.hypotheses.kernels import BACKLASH, HYSTERESIS, Law, along_motion
+from ident.hypotheses.loop import steady_loop
+from ident.hypotheses.yielding import bristle
+from ident.recursion import chain_of, newton_euler
+from robot_assets.robot import load_robot
+
+
+def precompile() -> None:
+    """Call what a diagnosis calls of compiled code, with next to no data."""
+    still, mode = np.zeros((1, 4)), np.full((4, 1), 1e-3 + 0j)
+    newton_euler(chain_of(build_structure(load_robot("twomass")).model), *np.zeros((3, 1, 1)))
+    direction(still, 1e-3)
+    bristle(still, 1e-3, 1e-3, start=np.zeros(1))
+    for law in (Law(BACKLASH, 1.0, 0.0, 1.0), Law(HYSTERESIS, 1.0, 1.0, 1.0)):
+        along_motion(law, still, still)
+        steady_loop(law, still, still, mode)
+
+
+if __name__ == "__main__":
+    precompile()
