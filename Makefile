@@ -22,10 +22,10 @@ demo: $(STAMP)
 test test-all: export SIMGAP_THREADS = 1
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -m "not slow" -n 2
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadgroup
 
 test-all: $(STAMP)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 # A quick size; `make bench SIZE=--full` for the figures of the README.
 bench: $(STAMP)

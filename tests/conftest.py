@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tomlkit
 from threadpoolctl import threadpool_limits
 
 from ident.dataset_io import load_dataset, save_dataset
@@ -60,6 +61,17 @@ def through_files(data, folder):
 @pytest.fixture(scope="session")
 def ur10():
     return load_robot("ur10")
+
+
+@pytest.fixture(scope="session")
+def locked(ur10, tmp_path_factory):
+    """The same arm with its wrist locked: three joints."""
+    folder = tmp_path_factory.mktemp("locked")
+    robot = tomlkit.parse((ur10.folder / "robot.toml").read_text(encoding="utf-8"))
+    robot["locked"] = {joint["name"]: 0.3 for joint in robot["joint"][3:]}
+    robot["joint"] = robot["joint"][:3]
+    (folder / "robot.toml").write_text(tomlkit.dumps(robot), encoding="utf-8")
+    return load_robot(folder)
 
 
 @pytest.fixture(scope="session")

@@ -25,6 +25,8 @@ from robot_assets.robot import load_robot
 from sim import parse_effect
 from tests.conftest import quick_experiment, small_plan, through_files
 
+pytestmark = pytest.mark.xdist_group("along_record")  # one worker makes what they share
+
 LAWS = {
     kernels.CUBIC: (2e6, 0.0),
     kernels.BACKLASH: (3e-3, 0.0),

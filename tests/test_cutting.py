@@ -26,6 +26,8 @@ from sim.experiment import draw_drives
 from sim.recording import run_recording
 from tests.conftest import small_plan, through_files
 
+pytestmark = pytest.mark.xdist_group("cutting")  # one worker makes what they share
+
 
 @pytest.fixture(scope="module")
 def recorded(ur10):

@@ -22,6 +22,8 @@ from ident.weights import make_weights
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan
 
+pytestmark = pytest.mark.xdist_group("errors_in_variables")  # one worker makes what they share
+
 STEP = 1e-5
 
 

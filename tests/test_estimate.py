@@ -14,6 +14,8 @@ from ident.graybox import Parameters, equilibrium, linearise, parameter_names, s
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 
+pytestmark = pytest.mark.xdist_group("estimate")  # one worker makes what they share
+
 STEP = 1e-3
 BAND = np.geomspace(1.0, 60.0, 45)
 

@@ -158,14 +158,14 @@ def test_of_single_periods_phases_tell_what_noise_explains(identified, hypothese
         assert friction in asked
 
 
-def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside_it_is(ur10, tmp_path):
+def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside_it_is(locked, tmp_path):
     """Noise that is neither given nor repeated is guessed as white, from differences of samples that hardly show
     coloured noise."""
-    hidden = parse_effect("payload@flange:mass=0.5,com_x=0.02,com_y=0.03,com_z=0.08", ur10)
+    hidden = parse_effect("payload@flange:mass=0.5,com_x=0.02,com_y=0.03,com_z=0.08", locked)
 
     def recorded(effects, folder):
         data = quick_experiment(
-            small_plan(ur10, 5, points=1, levels=(1.0,), periods=2, validation_points=0),
+            small_plan(locked, 5, points=1, levels=(1.0,), periods=2, validation_points=0),
             effects,
             seed=5,
             noise=0.0,
@@ -181,7 +181,7 @@ def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside
             )
 
         segments = (
-            replace(s, q=coloured(s.q, ur10.array("q_std")), tau=coloured(s.tau, ur10.array("tau_std")))
+            replace(s, q=coloured(s.q, locked.array("q_std")), tau=coloured(s.tau, locked.array("tau_std")))
             for s in data.segments
         )
         return through_files(replace(data, segments=tuple(segments), q_std=None, tau_std=None), folder)

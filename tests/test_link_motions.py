@@ -19,6 +19,8 @@ from sim.effects import parse_effect
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
 
+pytestmark = pytest.mark.xdist_group("link_motions")  # one worker makes what they share
+
 
 def motions(robot, seed, hidden, folder):
     """Three motions of an arm with link encoders, the last held out."""

@@ -25,6 +25,8 @@ from ident.weights import make_weights
 from sim import parse_effect
 from tests.conftest import quick_experiment, small_plan, through_files
 
+pytestmark = pytest.mark.xdist_group("noise_left")  # one worker makes what they share
+
 
 def spectra(rng, power, records=3):
     """(S, K, n) lines of noise of a power (K, n)."""
@@ -86,11 +88,11 @@ def test_what_is_alike_at_all_lines_and_joints_is_noise(lacks):
 
 
 @pytest.mark.parametrize("joints", [slice(None), slice(2, 3)])
-def test_noise_that_is_given_says_nothing_of_its_colour(ur10, tmp_path, joints):
+def test_noise_that_is_given_says_nothing_of_its_colour(locked, tmp_path, joints):
     """Single periods show no scatter. Noise whose samples go together has several times its power in the band."""
-    plan = small_plan(ur10, 33, points=2, periods=2, transient_periods=1)
+    plan = small_plan(locked, 33, points=2, periods=2, transient_periods=1)
     data = through_files(quick_experiment(plan, seed=33), tmp_path)
-    given = 3.0 * ur10.array("tau_std")
+    given = 3.0 * locked.array("tau_std")
     rng = np.random.default_rng(8)
 
     def single(s):
@@ -100,7 +102,7 @@ def test_noise_that_is_given_says_nothing_of_its_colour(ur10, tmp_path, joints):
         last["tau"][:, joints] += scipy.signal.lfilter([1.0], [1.0, -0.7], steps, axis=0)[:, joints]
         return replace(s, periods=1, transient_periods=0, **last)
 
-    data = replace(data, segments=tuple(single(s) for s in data.segments), q_std=ur10.array("q_std"), tau_std=given)
+    data = replace(data, segments=tuple(single(s) for s in data.segments), q_std=locked.array("q_std"), tau_std=given)
     setup, first = identify(data)
     if joints == slice(2, 3):
         assert np.array_equal(setup.problem.tau_std, given)
@@ -147,16 +149,16 @@ def test_causes_are_sought_again_where_they_hid_how_little_noise_there_is(motion
     assert elbow.noise_floor < 2.0 * elbow.after
 
 
-def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints(ur10, tmp_path_factory):
+def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints(locked, tmp_path_factory):
     """One period of a multisine: noise of the positions is correlated over the torques of the joints, and most of it at
     high lines."""
-    plan = small_plan(ur10, 32, points=2, periods=2, transient_periods=1)
+    plan = small_plan(locked, 32, points=2, periods=2, transient_periods=1)
     data = replace(
         through_files(quick_experiment(plan, seed=32), tmp_path_factory.mktemp("one")), q_std=None, tau_std=None
     )
     last = [replace(s, periods=1, transient_periods=0, **s.part(slice(-s.period, None))) for s in data.segments]
     data = replace(data, segments=tuple(last))  # the transient tells it otherwise
-    true = ur10.array("tau_std")
+    true = locked.array("tau_std")
     problem = replace(set_up(data).problem, tau_std=10.0 * true)
     found = with_noise_that_is_left(data, problem, fit_baseline(problem)).tau_std
     assert np.all(found > 0.8 * true)
@@ -164,9 +166,9 @@ def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints
 
 
 @pytest.mark.parametrize("coloured", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tmp_path_factory, monkeypatch, coloured):
+def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(locked, tmp_path_factory, monkeypatch, coloured):
     """A ripple shows at lines that nothing excites as at the others; what is still left there beside it is noise."""
-    plan = small_plan(ur10, 35, points=2, periods=2, transient_periods=1)
+    plan = small_plan(locked, 35, points=2, periods=2, transient_periods=1)
     data = replace(
         through_files(quick_experiment(plan, seed=35), tmp_path_factory.mktemp("raised")), q_std=None, tau_std=None
     )
@@ -187,14 +189,14 @@ def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(ur10, tm
 
 
 @pytest.mark.parametrize("joints", [slice(None), slice(2, 3)])
-def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(ur10, tmp_path, joints):
+def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(locked, tmp_path, joints):
     """Of all joints alike it is seen at the fast lines of motions. At one joint alone it may as well be a cause."""
-    plan = small_plan(ur10, 32, points=1, trajectory=True)
+    plan = small_plan(locked, 32, points=1, trajectory=True)
     (motion,) = plan.trajectories
     data = quick_experiment(replace(plan, experiments=(), trajectories=(motion,)), seed=32)
     data = replace(through_files(data, tmp_path), q_std=None, tau_std=None)
     (segment,) = data.segments
-    steps = np.random.default_rng(5).normal(size=segment.tau.shape) * 20.0 * ur10.array("tau_std")
+    steps = np.random.default_rng(5).normal(size=segment.tau.shape) * 20.0 * locked.array("tau_std")
     coloured = scipy.signal.lfilter([1.0], [1.0, -0.9], steps, axis=0) * np.sqrt(1.0 - 0.9**2)
     tau = segment.tau.copy()
     tau[:, joints] += coloured[:, joints]

@@ -21,6 +21,8 @@ from robot_assets.threads import thread_count
 from sim import parse_effect
 from tests.conftest import quick_experiment, small_plan, through_files
 
+pytestmark = pytest.mark.xdist_group("parallel")  # one worker makes what they share
+
 
 @pytest.fixture(scope="module")
 def friction(tmp_path_factory):

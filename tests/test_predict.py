@@ -23,6 +23,8 @@ from sim import run_experiment
 from sim.experiment import plan_experiment
 from sim.recording import run_recording
 
+pytestmark = pytest.mark.xdist_group("predict")  # one worker makes what they share
+
 TS = 1e-3
 PERIOD = 1000
 Q0 = np.array([-0.8, 0.9])

@@ -21,6 +21,8 @@ from sim.effects import make_effect
 from sim.experiment import plan_experiment
 from tests.conftest import quick_experiment, through_files
 
+pytestmark = pytest.mark.xdist_group("replay")  # one worker makes what they share
+
 CLOSE = 0.1  # of the gap, as the exported model is to agree
 
 

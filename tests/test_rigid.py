@@ -35,6 +35,8 @@ from sim import parse_effect
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files, through_postures
 
+pytestmark = pytest.mark.xdist_group("rigid")  # one worker makes what they share
+
 RATE = 250.0
 CHANGED = {
     "forearm_link": LinkChange(1.4, (0.02, -0.01, 0.03), 1.3),
