@@ -102,8 +102,10 @@ def both_gains(dataset: Dataset, effect, segments: int = 2) -> tuple[Gain, Gain]
     predicted, _ = segment_errors(problem, groups, baseline.model, result.model)
     values = {k: v.value for k, v in baseline_values(result)[0].items()}
     after = build_mjcf(robot, values, [cause_of(e, result) for e in result.model.effects])
-    note_record(after, result.model.par.timing, {})
-    simulated = simulated_errors(problem, groups, result.model, export_baseline(baseline.model), after)
+    note_record(after, result.model.par.timing, problem.sampling.roll_off, {})
+    simulated = simulated_errors(
+        problem, groups, result.model, export_baseline(baseline.model, problem.sampling), after
+    )
     excess = (predicted.before - predicted.noise).sum(axis=0)
     affected = np.flatnonzero(excess >= 0.1 * excess.sum())
     rng = np.random.default_rng(0)

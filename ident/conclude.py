@@ -238,6 +238,17 @@ def drift_note(problem: Problem) -> tuple[str, ...]:
     )
 
 
+def roll_off_note(problem: Problem) -> str:
+    """A record of the torque that loses something towards high frequencies, or gains it, at all joints."""
+    omega = max(float(g.omega[g.n_compared - 1]) for g in problem.groups if g.window is None)
+    lost = problem.sampling.roll_off * omega**2
+    return (
+        f"The recorded torque is {abs(lost):.2%} too {'small' if lost > 0.0 else 'large'} at {omega / 2.0 / np.pi:.3g} Hz,"
+        " by the square of the frequency and alike at all joints. That is taken for the recorder, which averages samples or"
+        " holds them, and not for a cause."
+    )
+
+
 def tone_note(tone: Tone, joint: str) -> str:
     """What shakes a joint at a frequency of its own, in a sentence."""
     return (

@@ -12,7 +12,7 @@ import numpy as np
 from ident.attribute import Attribution, attribute
 from ident.baseline import fit_baseline
 from ident.chain import build_structure
-from ident.conclude import conclude, named_effects
+from ident.conclude import conclude, named_effects, roll_off_note
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, ratio_interval, segment_errors
@@ -148,6 +148,8 @@ def diagnose_fully(
     if rigid is not None and setup.held_out:
         notes.append("Held-out motions took part in the choice between these inertias and those of the description.")
     notes += [f"Not used: {line}." for line in not_fitted(given)]
+    if problem.sampling.roll_off:
+        notes.append(roll_off_note(problem))
     if gain is None and not setup.held_out:
         notes.append(
             "No gain is measured: nothing is held out, and of a single operating point nothing can be left out."
@@ -171,6 +173,7 @@ def diagnose_fully(
         next_plan=separating.plan if separating else None,
         inertias=problem.structure.inertias,
         timing=result.final.model.par.timing,
+        roll_off=problem.sampling.roll_off,
         candidates=tuple(
             tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
         ),
@@ -285,7 +288,8 @@ def by_link_encoders(
     )
     wide = set_up(dataset, fast=True)
     recorded = wide.problem.groups
-    wide = replace(wide, problem=with_link_encoders(wide.problem, late))
+    known = {name: getattr(setup.problem, name) for name in ("q_std", "tau_std", "sampling")}
+    wide = replace(wide, problem=replace(with_link_encoders(wide.problem, late), **known))
     try:
         both = fit_baseline(wide.problem, workers.say)
         found = attribute(wide.problem, both, max_causes=max_causes, workers=workers.for_half())

@@ -131,7 +131,7 @@ def weigh(
     evidence = -0.5 * np.sum(more / tempers, axis=1)
     far = np.sum(more, axis=1) > FAR * np.sum(falls)
     evidence = np.where(far, np.minimum(evidence, -0.5 * np.sum(more, axis=1) / seen), evidence) - DECOY_NATS * decoy
-    evidence += [occam(c, seen) + c.hypothesis.options.get("nats", 0.0) for c in candidates]
+    evidence += [occam(c, seen) + odds(c) for c in candidates]
     evidence -= evidence.max()
     probability = np.exp(evidence) / np.exp(evidence).sum()
     out = [
@@ -139,6 +139,12 @@ def weigh(
         for c, e, p in zip(candidates, evidence, probability, strict=True)
     ]
     return sorted(out, key=lambda c: -c.probability)
+
+
+def odds(candidate: Candidate) -> float:
+    """Log odds of a hypothesis before the data, at the values that they ask for."""
+    nats = candidate.hypothesis.options.get("nats")
+    return 0.0 if nats is None else float(nats(candidate.fit.model.effects[-1].p))
 
 
 def occam(candidate: Candidate, temper: float) -> float:

@@ -31,6 +31,7 @@ from ident.quantization import Steps, find_steps, with_rounding
 from ident.records import build_groups
 from ident.refits import FAINT, under_own_noise
 from ident.rest import difference_noise
+from ident.roll_off import with_roll_off
 from ident.swings import without_swings
 from ident.torque_fit import Fit
 from robot_assets.errors import DataError
@@ -174,7 +175,8 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     """Baseline parameters by maximum likelihood on the torque residual."""
     setup = set_up(dataset)
     try:
-        result = fit_baseline(setup.problem, progress)
+        problem, result = with_roll_off(setup.problem, fit_baseline(setup.problem, progress))
+        setup = replace(setup, problem=problem)
         louder = with_noise_of_unexcited_lines(dataset, setup.problem, result)
         if louder is not setup.problem:
             setup = replace(setup, problem=louder)

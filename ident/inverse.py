@@ -33,6 +33,7 @@ REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
 STALL_STEPS = 12  # in which the change must halve: where no motion repeats the search for one does not end
 NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
+LEAST_KEPT = 0.1  # of the torque, that its record keeps of any line
 ROUNDING = 1e-12  # of the recorded torque, below which a remainder is none
 REMAINDER_POINTS = 2.5  # time grid of the remainder, in points per line
 REACTION_CHANGE = 1e-5  # relative change that ends them
@@ -40,10 +41,12 @@ REACTION_CHANGE = 1e-5  # relative change that ends them
 
 @dataclass(frozen=True)
 class Sampling:
-    """How torque and position were sampled: sample time, s, and the hold of the torque."""
+    """How torque and position were sampled: sample time, s, the hold of the torque, and what its record loses towards
+    high frequencies at all joints alike, s2 (``roll_off``)."""
 
     sample_time: float
     hold: str
+    roll_off: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,13 @@ def make_plane(structure: Structure, par: Parameters, group: Group, sampling: Sa
     """Linearise a group at its own parameter-dependent equilibrium."""
     lin = linearise(structure, equilibrium(structure, par, group.posture))
     hold = hold_response(group.omega, sampling.sample_time, sampling.hold)
-    return plane_at(structure, par, lin, group, np.exp(1j * group.omega * par.timing) / hold)
+    record = recorded_share(group.omega, par.timing, sampling.roll_off) / hold
+    return plane_at(structure, par, lin, group, record)
+
+
+def recorded_share(omega: np.ndarray, timing: float, roll_off: float) -> np.ndarray:
+    """What a record holds of the torque of a line, beside how that is held; (L,)."""
+    return np.exp(1j * omega * timing) * np.maximum(1.0 - roll_off * omega**2, LEAST_KEPT)
 
 
 def plane_at(structure: Structure, par: Parameters, lin: Linearisation, group: Group, record: np.ndarray) -> Plane:

@@ -226,7 +226,8 @@ class Diagnosis:
     """Everything a report or recording shows.
 
     ``inertias`` of bodies by joint of the description, where they were found; ``parameters`` of the drives; ``timing``,
-    s: delay of the torque against its record that the hold does not explain.
+    s: delay of the torque against its record that the hold does not explain; ``roll_off``, s2: what that record loses
+    (``ident.roll_off``).
     """
 
     verdict: Verdict
@@ -242,6 +243,7 @@ class Diagnosis:
     next_plan: Plan | None = None
     inertias: dict[str, pin.Inertia] = field(default_factory=dict)
     timing: float = 0.0
+    roll_off: float = 0.0
 
 
 def _plain(x: Any) -> Any:

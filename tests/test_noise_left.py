@@ -166,7 +166,9 @@ def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints
 
 
 @pytest.mark.parametrize("coloured", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(locked, tmp_path_factory, monkeypatch, coloured):
+def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(
+    locked, tmp_path_factory, monkeypatch, coloured
+):
     """A ripple shows at lines that nothing excites as at the others; what is still left there beside it is noise."""
     plan = small_plan(locked, 35, points=2, periods=2, transient_periods=1)
     data = replace(

@@ -63,7 +63,9 @@ def test_the_impedance_of_the_file_is_that_of_the_model():
     )
     setup = set_up(data)
     model, group = Model(setup.problem.structure, setup.problem.nominal), setup.problem.groups[0]
-    arm = load_arm(export_baseline(model), robot.joint_names, setup.problem.sampling.sample_time)
+    arm = load_arm(
+        export_baseline(model, setup.problem.sampling), robot.joint_names, setup.problem.sampling.sample_time
+    )
     rest, hold = equilibrium(arm, group.posture)
     got = sampled_impedance(arm, rest, hold, group.omega, 4)[1 : group.n_compared]
     prediction = predict(model, group, setup.problem.sampling)
@@ -81,7 +83,9 @@ def test_a_true_model_needs_the_torque_that_was_recorded(clean_drive, kind):
     groups = build_groups(clean_drive, role=None)
     group = next(g for g in groups if (g.window is None) == (kind == "multisine"))
     model = Model(setup.problem.structure, setup.problem.nominal)
-    arm = load_arm(export_baseline(model), clean_drive.joints, setup.problem.sampling.sample_time)
+    arm = load_arm(
+        export_baseline(model, setup.problem.sampling), clean_drive.joints, setup.problem.sampling.sample_time
+    )
     done = replay(arm, group, setup.problem.sampling)
     predicted = predict(model, group, setup.problem.sampling).U
     size = np.linalg.norm(group.observe(group.U)[:, 1:])
@@ -91,17 +95,16 @@ def test_a_true_model_needs_the_torque_that_was_recorded(clean_drive, kind):
     assert done.change < 0.02
 
 
-def test_offset_and_timing_of_the_record_are_no_part_of_the_motor(clean_drive):
+def test_offset_timing_and_roll_off_of_the_record_are_no_part_of_the_motor(clean_drive):
     setup = set_up(clean_drive)
     group = setup.held_out[0]
     model = Model(setup.problem.structure, setup.problem.nominal)
-    plain = export_baseline(model)
-    late = export_baseline(model)
-    for key, value in {"timing": 2e-4, "torque_offset.drive": 0.5}.items():
+    plain, late = (export_baseline(model, setup.problem.sampling) for _ in range(2))
+    for key, value in {"timing": 2e-4, "roll_off": 1e-7, "torque_offset.drive": 0.5}.items():
         number = late.add_numeric(name=f"simgap.record.{key}")
         number.data, number.size = [value], 1
     a, b = (replay(load_arm(x, clean_drive.joints, 1e-3), group, setup.problem.sampling).U for x in (plain, late))
-    a = a * np.exp(2e-4j * group.omega)[:, None]
+    a = a * (np.exp(2e-4j * group.omega) * (1.0 - 1e-7 * group.omega**2))[:, None]
     a[:, 0] += 0.5
     assert np.linalg.norm(group.observe(a - b)) < 1e-3 * np.linalg.norm(group.observe(a))
 

@@ -16,6 +16,7 @@ from ident.inverse import Plane
 from ident.motion import Solution
 
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
+EXACT = 0.01  # of the mass of that body, up to which no description is exact: a load of less has no odds over it
 SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
 FARTHEST = 2.0  # m, of the centre of mass of a load
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
@@ -122,7 +123,7 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_l
         variable="posture",
         options={
             "body": link,
-            "nats": -LOAD_NATS if carries_load else 0.0,
+            "nats": lambda p: -LOAD_NATS * (carries_load and abs(p[0] - 1.0) > EXACT),
             "with_load": with_load,
             "carries_load": carries_load,  # what it carries and its own body are one to the data
             "change": lambda p: Change(links=((link, how(p)),)),

@@ -169,7 +169,7 @@ def joint_coupling(source: int, target: int, place: str, turned: str) -> Hypothe
             "change": lambda p: Change(coupling=((target, source, float(p[0])),)),
             "responses": responses,
             "start": lambda c: np.array([np.clip(c[0], -1.5, 1.5)]),
-            "nats": 0.0 if target == source + 1 else -DISTANT_NATS,
+            "nats": lambda p: 0.0 if target == source + 1 else -DISTANT_NATS,
         },
     )
 

@@ -70,7 +70,7 @@ def write_mjcf(diagnosis: Diagnosis, path: Path) -> None:
     spec = build_mjcf(diagnosis.robot, diagnosis.parameters, diagnosis.verdict.causes, diagnosis.inertias)
     baseline = diagnosis.verdict.baseline
     offsets = {k.split(".", 1)[1]: v.value for k, v in baseline.items() if k.startswith(f"{TORQUE_OFFSET}.")}
-    note_record(spec, diagnosis.timing, offsets)
+    note_record(spec, diagnosis.timing, diagnosis.roll_off, offsets)
     spec.compile()
     path.write_text(spec.to_xml(), encoding="utf-8")
 
@@ -293,14 +293,16 @@ def stage_lead(timestep: float, integrator: int) -> float:
     return 0.5 * timestep if integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.0
 
 
-def note_record(spec: mujoco.MjSpec, timing: float, offsets: dict[str, float]) -> None:
+def note_record(spec: mujoco.MjSpec, timing: float, roll_off: float, offsets: dict[str, float]) -> None:
     """What the recorded torque has beyond that of the motors: numbers ``simgap.record.*``.
 
     Args:
         timing: delay of the torque against its record that the hold does not explain, s.
+        roll_off: what the record loses towards high frequencies, s2.
         offsets: constant errors of the recorded torque by joint, N m.
     """
-    for key, value in {"timing": timing, **{f"{TORQUE_OFFSET}.{k}": v for k, v in offsets.items()}}.items():
+    errors = {f"{TORQUE_OFFSET}.{k}": v for k, v in offsets.items()}
+    for key, value in {"timing": timing, "roll_off": roll_off, **errors}.items():
         if value:
             number = spec.add_numeric(name=f"simgap.record.{key}")
             number.data, number.size = [float(value)], 1

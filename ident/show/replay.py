@@ -25,7 +25,7 @@ from mujoco.batch import Batch
 
 from ident.graybox import hold_response
 from ident.group import Group
-from ident.inverse import Sampling
+from ident.inverse import Sampling, recorded_share
 from ident.show.export import FRICTION_SLIP, PASSIVE_GROUP, TORQUE_OFFSET, stage_lead
 
 LOOP = 0.15  # frequency of the loop times the time by which torque lags what the loop sees, rad
@@ -45,7 +45,7 @@ class Arm:
         motor: (n,) addresses of the rotors in qpos and qvel alike. drive: (n,) ids of the actuators.
         gear: (n,) torque delivered per torque commanded, in the steady state.
         limit: (n,) N m, on the command. delay, lag: (n,) s, of the drives. sensor_delay: (n,) s, of the motor encoders.
-        timing, offset: s and (n,) N m, what the record of the torque has beyond the motors' own.
+        timing, roll_off, offset: s, s2 and (n,) N m, what the record of the torque has beyond the motors' own.
     """
 
     model: mujoco.MjModel
@@ -57,6 +57,7 @@ class Arm:
     lag: np.ndarray
     sensor_delay: np.ndarray
     timing: float
+    roll_off: float
     offset: np.ndarray
 
     @property
@@ -129,6 +130,7 @@ def load_arm(source: str | Path | mujoco.MjSpec, joints: Sequence[str], sample_t
         lag=lag,
         sensor_delay=late,
         timing=record.get("simgap.record.timing", 0.0),
+        roll_off=record.get("simgap.record.roll_off", 0.0),
         offset=np.array([record.get(f"simgap.record.{TORQUE_OFFSET}.{name}", 0.0) for name in joints]),
     )
 
@@ -145,7 +147,7 @@ def replay(arm: Arm, group: Group, sampling: Sampling) -> Replay:
     N = round(group.period_time / sampling.sample_time)
     m = round(sampling.sample_time / h)
     s = 1j * group.omega[:, None]
-    shift = np.exp(s * arm.timing)
+    shift = recorded_share(group.omega, arm.timing, arm.roll_off)[:, None]
     rest, hold = equilibrium(arm, group.posture)
     Z = (
         sampled_impedance(arm, rest, hold, group.omega, m)

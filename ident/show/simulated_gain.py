@@ -16,6 +16,7 @@ from ident.graybox import parameter_names
 from ident.group import Group
 from ident.held_out import with_held_out
 from ident.identification import identify
+from ident.inverse import Sampling
 from ident.model import Model
 from ident.output_noise import noise_covariance
 from ident.parallel import one_thread_each
@@ -65,19 +66,20 @@ def simulated_gain(
     affected = affected_joints(problem, baseline, predictions(problem, baseline.model, baseline.remainders))
     if progress is not None:
         progress("simulation of both models")
-    errors = simulated_errors(problem, groups, baseline.model, export_baseline(baseline.model), model)
+    before = export_baseline(baseline.model, problem.sampling)
+    errors = simulated_errors(problem, groups, baseline.model, before, model)
     rng = np.random.default_rng(SEED)
     return measure_gain(
         errors, units_of_torques(problem.structure.robot), affected, "simulated in closed loop", rng, METRIC
     )
 
 
-def export_baseline(model: Model) -> mujoco.MjSpec:
+def export_baseline(model: Model, sampling: Sampling) -> mujoco.MjSpec:
     """MJCF of a model without effects, with what the record of its torque has beyond it."""
     robot = model.structure.robot
     values = dict(zip(parameter_names(robot), np.exp(model.par.to_log()), strict=True))
     spec = build_mjcf(robot, values, inertias=model.structure.inertias)
-    note_record(spec, model.par.timing, {})
+    note_record(spec, model.par.timing, sampling.roll_off, {})
     return spec
 
 

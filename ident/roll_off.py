@@ -1,0 +1,81 @@
+"""What the record of the torque loses towards high frequencies, at all joints alike.
+
+Where nothing says how the torque was held and sampled, as of a loop that is faster than the record, a recorder may
+average samples, or hold them: ``recorded = actual exp(j w timing) (1 - roll_off w^2)``. An effect of the catalogue has
+one joint; a recorder has all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ident.baseline import renewed
+from ident.coordinates import prior_of
+from ident.derivatives import jacobians, normal_equations
+from ident.problem import Problem, predictions
+from ident.torque_fit import RIDGE, Fit, inverse
+
+LEAST_JOINTS = 3  # two may differ by an effect at either
+SURE = 5.0  # standard deviations from nothing
+ALIKE = 4.0  # the same of a joint from what all share
+SLACK = 0.25  # of the roll-off, by which a joint may differ beside that: its model is not exact
+LARGEST = 0.1  # sample times squared
+TELLING = 0.25  # share of what a joint leaves beyond noise, that its part of the roll-off must explain
+STEPS = 2  # from where a fit ends to where it ends with them
+
+
+def with_roll_off(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
+    """A problem and its fit with the roll-off that most joints share; as they are where that explains little of what
+    most of them leave."""
+    first, start = result, problem
+    for _ in range(STEPS):
+        more = shared_roll_off(problem, result)
+        if not more:
+            break
+        sampling = problem.sampling
+        problem = replace(problem, sampling=replace(sampling, roll_off=sampling.roll_off + more))
+        result = renewed(problem, result)
+    before, after = (r.costs - r.counts for r in (first, result))
+    explained = after < (1.0 - TELLING) * before
+    return (problem, result) if 2 * np.sum(explained) > len(explained) else (start, first)
+
+
+def shared_roll_off(problem: Problem, result: Fit) -> float:
+    """Roll-off, s2, that a fit leaves in the records of the torque of most joints; 0 where there is none, or where it
+    cannot be told.
+
+    A linear step: each joint with a roll-off of its own, beside the coordinates of the fit. Most joints must agree.
+    """
+    n = problem.structure.n
+    if problem.sampling.hold != "none" or problem.motions_alone or n < LEAST_JOINTS:
+        return 0.0
+    preds = predictions(problem, result.model, result.remainders)
+    center, prior = prior_of(problem, result.model)
+    p = len(center)
+    columns = []
+    for made, pred in zip(jacobians(problem, result.model, preds, exact=False), preds, strict=True):
+        S, top, outputs, _ = made.whole.shape
+        lost = np.zeros((n, S, top, outputs), complex)
+        for j in range(n):
+            lost[j, ..., j] = (pred.plane.s[:top] ** 2) * pred.U[:, :top, j]
+        columns.append(made.replaced({p + j: lost[j] for j in range(n)}))
+    H, b = normal_equations(problem, columns, preds, result.weights)
+    H = H + np.diag(np.concatenate([prior, np.zeros(n)]))
+    covariance = inverse(H, RIDGE)
+    own = (covariance @ b)[p:]
+    std = np.sqrt(max(result.chi2_per_dof, 1.0) * np.diag(covariance)[p:])
+    return agreed(own, std, LARGEST * problem.sampling.sample_time**2)
+
+
+def agreed(values: np.ndarray, std: np.ndarray, limit: float) -> float:
+    """The value that most of some (n,) agree on within their standard deviations; 0 where that is nothing, or beyond a
+    limit, or where they differ."""
+    order = np.argsort(values)
+    weight = np.cumsum(std[order] ** -2.0)
+    middle = float(values[order][np.searchsorted(weight, 0.5 * weight[-1])])
+    near = np.abs(values - middle) < ALIKE * std + SLACK * abs(middle)
+    told = near & (std < abs(middle) / SURE)
+    most = 2 * np.sum(near) > len(values) and np.sum(told) >= LEAST_JOINTS - 1
+    return middle if most and abs(middle) < limit else 0.0
