@@ -14,9 +14,14 @@ MOTOR_ORDERS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # periods in a turn of
 PERIODOGRAM_RECORDS = 12  # loudest records that the search over motor angle looks at
 WAVE_STEPS = 259, 2000  # steps of that search: for periodic records, and at most
 WAVES_AT_ONCE = 260
+LONG_WAVES = 3  # longer than a posture shows, that are tried
+LEAST_POSTURES = 3  # a wave of any length fits the constants of two
 FEWEST = 20  # samples in which a wave must lie in the compared band
 FOLLOWED = 0.1  # share of the path of a motion along which a ripple must, for its wave number to be looked for
 REFINED_SAMPLES = 3000  # that wave numbers are refined with
+
+Part = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Motor angle (T,), what is known beforehand (T, m), orthonormal, and the torque that is left without it (T,)."""
 
 
 def wave_numbers(problem: Problem, predictions: Sequence[Prediction], joint: int) -> tuple[float, ...]:
@@ -37,7 +42,8 @@ def position_lines(
 
     A least-squares periodogram over the motor angle: for each wave number, sine and cosine with
     weights of their own in every posture, so that no phase has to be carried between postures;
-    then the best ones are refined with one phase for all.
+    then the best ones are refined with one phase for all. Waves that are longer than a posture shows are sought over all
+    postures from the first.
     """
     records = _loudest(problem, predictions, joint)
     span = max((np.ptp(x.q) for x in records), default=0.0)
@@ -54,18 +60,21 @@ def position_lines(
             best.append(float(coarse[k]))
         if len(best) == count or power[k] < 1e-3 * total:
             break
-    return tuple(f for n in best for f in _refine(records, n, step))
+    return (*(f for n in best for f in _refine(records, n, step)), *_long_waves(records, step))
 
 
 @dataclass(frozen=True)
 class _Record:
     """Residual torque of a joint over its motor angle, samples of one record.
 
-    ``q``, ``residual`` (T,), the latter without what ``nuisance`` (T, m), orthonormal, explains; ``speed`` (T,) rad/s;
-    ``top`` rad/s: frequency up to which a motion is compared, infinite for periodic records.
+    ``q``, ``residual`` (T,), the latter without what ``nuisance`` (T, m), orthonormal, explains; ``torque`` (T,) with
+    it; ``drive`` (T, 2): velocity and acceleration; ``speed`` (T,) rad/s; ``top`` rad/s: frequency up to which a motion
+    is compared, infinite for periodic records.
     """
 
     q: np.ndarray
+    torque: np.ndarray
+    drive: np.ndarray
     speed: np.ndarray
     nuisance: np.ndarray
     residual: np.ndarray
@@ -102,7 +111,8 @@ def _loudest(problem: Problem, predictions: Sequence[Prediction], joint: int) ->
         for q, v, a, r in zip(*(x[:, pick] for x in signals), strict=True):
             known = np.stack([np.ones_like(v), q - q.mean(), v, a, np.sign(v)], axis=1)
             known = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))[0]
-            records.append(_Record(q, np.abs(v), known, r - known @ (known.T @ r), top))
+            left = r - known @ (known.T @ r)
+            records.append(_Record(q, r, np.stack([v, a], axis=1), np.abs(v), known, left, top))
         out += sorted(records, key=lambda x: -float(x.residual @ x.residual))[:each]
     return out
 
@@ -137,9 +147,13 @@ def _refine(records: Sequence[_Record], center: float, width: float, count: int 
     Postures far apart leave a comb of nearly equal maxima; the best of them are all returned.
     """
     spread = np.ptp([x.q.mean() for x in records]) + np.ptp(records[0].q)
-    count_fine = int(np.clip(6 * width * spread, 41, 1500))
-    first, step = center - 1.5 * width, 3.0 * width / (count_fine - 1)
-    parts = _seen(records, center)
+    return _peaks(_seen(records, center), spread, center - 1.5 * width, center + 1.5 * width, count)
+
+
+def _peaks(parts: Sequence[Part], spread: float, first: float, last: float, count: int) -> list[float]:
+    """Wave numbers from ``first`` to ``last`` that explain most, over motor angles that far apart."""
+    count_fine = int(np.clip(2 * (last - first) * spread, 41, 1500))
+    step = (last - first) / (count_fine - 1)
     power = _coherent_power(parts, first, step, count_fine)
     peaks = np.flatnonzero((power >= np.roll(power, 1)) & (power >= np.roll(power, -1)))
     out = []
@@ -150,7 +164,25 @@ def _refine(records: Sequence[_Record], center: float, width: float, count: int 
     return out
 
 
-def _seen(records: Sequence[_Record], wave_number: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _long_waves(records: Sequence[_Record], width: float) -> list[float]:
+    """Wave numbers from one period over all postures to about ``2 width`` that explain most of the torque of all periodic records together.
+
+    Over less than a period a wave is a constant and a slope, which a posture alone cannot tell from other errors; over
+    several postures the constants and slopes are those of one wave. Friction and inertia of the motor are the same in
+    all.
+    """
+    whole = [x for x in records if np.isinf(x.top)]
+    at = np.sort([x.q.mean() for x in whole])
+    if 1 + np.sum(np.diff(at) > max((np.ptp(x.q) for x in whole), default=0.0)) < LEAST_POSTURES:
+        return []
+    thin = [slice(None, None, max(1, len(x.q) * len(whole) // REFINED_SAMPLES)) for x in whole]
+    q, r = (np.concatenate([getattr(x, key)[t] for x, t in zip(whole, thin, strict=True)]) for key in ("q", "torque"))
+    N = np.linalg.qr(np.concatenate([x.drive[t] for x, t in zip(whole, thin, strict=True)]))[0]
+    spread = np.ptp(q)
+    return _peaks([(q, N, r - N @ (N.T @ r))], spread, 2.0 * np.pi / spread, 2.5 * width, LONG_WAVES)
+
+
+def _seen(records: Sequence[_Record], wave_number: float) -> list[Part]:
     """Motor angle, what is known beforehand and residual of each record where a wave lies in the compared band; some
     thousand samples."""
     most = max(250, REFINED_SAMPLES // len(records))
@@ -165,9 +197,7 @@ def _seen(records: Sequence[_Record], wave_number: float) -> list[tuple[np.ndarr
     return out
 
 
-def _coherent_power(
-    parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], first: float, step: float, count: int
-) -> np.ndarray:
+def _coherent_power(parts: Sequence[Part], first: float, step: float, count: int) -> np.ndarray:
     """Fall of the squared residual by a sine and a cosine of each wave number, one phase for all records.
 
     Of each wave what is known of its record beforehand is left out: of less than a period that is most of it.

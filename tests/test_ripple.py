@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from ident.diagnosis import diagnose
 from ident.hypotheses import catalogue
 from ident.hypotheses.ripple import ripple
+from ident.identification import identify
+from ident.position_lines import wave_numbers
 from ident.problem import predictions
-from ident.screening import Score, other_waves
+from ident.screening import Score, other_waves, screen
 from sim import parse_effect
 from sim.effects.effect import Torque
 from sim.effects.transmission import carried
@@ -116,3 +118,20 @@ def test_a_ripple_with_a_second_harmonic_is_one_cause(ur10, tmp_path, name):
     assert found["amplitude"].value == pytest.approx(size, rel=0.03)
     assert found["periods_per_rev"].value == pytest.approx(202.0, rel=1e-3)
     assert verdict.unexplained_verdict == "noise floor reached"
+
+
+@pytest.mark.parametrize("number", [67.0, 23.7])
+def test_a_wave_longer_than_a_posture_shows_is_found_over_all_of_them(locked, number):
+    """No motor order, and a quarter of a period in each of three postures; drives as they are off their sheet."""
+    plan = small_plan(locked, 12, points=3, levels=(1.0,), period=1000, validation_points=0)
+    drives = draw_drives(np.random.default_rng(12), locked)
+    hidden = parse_effect(f"cogging@elbow_joint:amplitude=5,periods_per_rev={number},phase=0.6", locked)
+    setup, first = identify(quick_experiment(plan, [hidden], seed=12, drives=drives))
+    problem, preds = setup.problem, predictions(setup.problem, first.model, first.remainders)
+    spans = [np.ptp(g.to_time(g.Q)[..., 2], axis=1).max() for g in problem.groups]
+    assert number * max(spans) < 2.0
+    found = np.array(wave_numbers(problem, preds, 2))
+    assert np.min(np.abs(found / number - 1.0)) < 0.01
+    cogging = next(h for h in catalogue(problem.structure) if h.key == ("cogging", "elbow_joint"))
+    (score,) = screen(problem, first, preds, [cogging])
+    assert score.shape[0] == pytest.approx(number, rel=0.01)
