@@ -42,6 +42,7 @@ HALF_TRUSTED = 0.1
 # of the fall of the cost that a faint cause foretells on held-out data, below which it does not come
 DENIED_SHARE = 0.25
 CHANCE = 3.0  # standard deviations of that fall, within which it may be short by chance
+LATE = "_delay", "_lag"  # effects by which a channel comes late
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 
@@ -185,8 +186,8 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
         o = other.candidates[0].hypothesis
         if other is found or o.joint != h.joint or o.channel == "model" or o.decoy:
             continue
-        if o.effect == "gravity_spring" and element(h) == "friction":
-            continue  # what the law of a spring lacks follows the position, and stores what it takes
+        if o.effect == "gravity_spring" and (element(h) == "friction" or h.effect.endswith(LATE)):
+            continue  # what the law of a spring lacks follows the position, stores what it takes and is on time
         least = SHADOW
         if element(o) is not None and element(o) == element(h) and not explained_by_time(found):
             least = SHADOW_OF_LAW

@@ -238,6 +238,8 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
     assert shadowed(other, (spring, other))
     rub = round_of(named["coulomb_friction", "elbow_joint"], 100.0, 100.0 - left)
     assert not shadowed(rub, (spring, rub))  # what a spring lacks is no friction
+    late = round_of(named["torque_delay", "elbow_joint"], 100.0, 100.0 - left)
+    assert not shadowed(late, (spring, late))  # and it is on time
 
 
 @pytest.mark.parametrize(
