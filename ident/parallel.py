@@ -24,6 +24,11 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 ANSWER = 10.0  # s that a scheduler has to answer
+GRACE = 60.0  # s after a deadline, that a piece of work which has begun has to end
+
+
+class TimeIsUp(RuntimeError):
+    """A piece of work was given up for want of time."""
 
 
 def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -76,6 +81,20 @@ class Workers:
     def late(self) -> bool:
         """Whether the time is used up."""
         return time.monotonic() > self.deadline
+
+    @property
+    def until_late(self) -> Callable[[str], None]:
+        """For the progress of a long fit: raises ``TimeIsUp`` some time after the deadline.
+
+        Of an executor, whose pieces begin together, none is given up.
+        """
+        last = self.deadline + GRACE if self.executor is None else math.inf
+
+        def check(_: str) -> None:
+            if time.monotonic() > last:
+                raise TimeIsUp("the time for the search is used up")
+
+        return check
 
     def for_half(self) -> Workers:
         """The same, for half of the time that is left."""

@@ -165,7 +165,8 @@ def _peaks(parts: Sequence[Part], spread: float, first: float, last: float, coun
 
 
 def _long_waves(records: Sequence[_Record], width: float) -> list[float]:
-    """Wave numbers from one period over all postures to about ``2 width`` that explain most of the torque of all periodic records together.
+    """Wave numbers, from one period over all postures to about ``2 width``, that explain most of the torque of all
+    periodic records together.
 
     Over less than a period a wave is a constant and a slope, which a posture alone cannot tell from other errors; over
     several postures the constants and slopes are those of one wave. Friction and inertia of the motor are the same in

@@ -52,9 +52,8 @@ def shared_roll_off(problem: Problem, result: Fit) -> float:
     if problem.sampling.hold != "none" or problem.motions_alone or n < LEAST_JOINTS:
         return 0.0
     preds = predictions(problem, result.model, result.remainders)
-    center, prior = prior_of(problem, result.model)
-    p = len(center)
-    columns = []
+    _, prior = prior_of(problem, result.model)
+    p, columns = len(prior), []
     for made, pred in zip(jacobians(problem, result.model, preds, exact=False), preds, strict=True):
         S, top, outputs, _ = made.whole.shape
         lost = np.zeros((n, S, top, outputs), complex)

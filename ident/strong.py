@@ -62,13 +62,21 @@ def beside_strong(
         quiet: joints at which none is sought.
     """
 
+    until_late = workers.until_late
+
     def annealed(score: Score) -> Fit | None:
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                last = recovered(
-                    problem, anneal(problem, start, ladder=ANNEALING[1:], iterations=STRONG_STEPS, gap=STRONG_GAP)
+                first = anneal(
+                    problem,
+                    start,
+                    ladder=ANNEALING[1:],
+                    iterations=STRONG_STEPS,
+                    gap=STRONG_GAP,
+                    progress=until_late,
                 )
+                last = recovered(problem, first)
                 return either_turn(problem, last, last.model.effects[-1])
         except NOT_COMPUTED:
             return None

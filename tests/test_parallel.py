@@ -1,6 +1,7 @@
 """Where work runs changes nothing of what comes out."""
 
 import json
+import time
 from concurrent.futures import ProcessPoolExecutor
 from inspect import signature
 from multiprocessing import get_context
@@ -11,9 +12,12 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from ident.design import design_experiment
 from ident.diagnosis import diagnose, diagnose_fully
 from ident.estimate import fit_frf
+from ident.hypotheses import catalogue
 from ident.identification import identify
-from ident.parallel import Workers, map_threads, open_executor
+from ident.parallel import GRACE, TimeIsUp, Workers, map_threads, open_executor
+from ident.problem import NOT_COMPUTED, predictions
 from ident.screening import screen
+from ident.strong import beside_strong
 from ident.torque_fit import fit
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -132,3 +136,33 @@ def test_linear_algebra_starts_no_threads_within_what_users_call(function):
     with threadpool_limits(2), pytest.raises(Asked):
         function(**{p.name: Probe() for p in needed})
     assert seen and set(seen) == {1}
+
+
+def test_work_that_has_begun_is_given_up_some_time_after_the_deadline():
+    """As one whose model has no solution; never where an executor began all of it together."""
+    now = time.monotonic()
+    with pytest.raises(TimeIsUp):
+        Workers(deadline=now - GRACE - 1.0).until_late("a step")
+    assert issubclass(TimeIsUp, NOT_COMPUTED)
+    Workers(deadline=now - 1.0).until_late("a step")
+    Workers().until_late("a step")
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        Workers(executor=pool, deadline=now - GRACE - 1.0).until_late("a step")
+
+
+def test_a_strong_effect_that_takes_too_long_is_no_candidate(friction, monkeypatch):
+    data, _ = friction
+    setup, first = identify(data)
+    scores = screen(
+        setup.problem,
+        first,
+        predictions(setup.problem, first.model, first.remainders),
+        [h for h in catalogue(setup.problem.structure) if h.effect == "coulomb_friction"],
+    )
+    told: list[str] = []
+    in_time = Workers(progress=told.append)
+    found = beside_strong(setup.problem, first, [], scores, in_time)[1]
+    assert found and told
+    monkeypatch.setattr(Workers, "late", False)  # each is begun
+    late = Workers(progress=told.append, deadline=time.monotonic() - GRACE - 1.0)
+    assert beside_strong(setup.problem, first, [], scores, late)[1] == []
