@@ -26,12 +26,13 @@ from ident.evidence import (
     errors_by_joint,
     explained,
     occam,
+    odds,
     pointless,
     weigh,
 )
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
-from ident.hypotheses.bodies import link_inertia, payload, payload_like
+from ident.hypotheses.bodies import LOAD_NATS, link_inertia, payload, payload_like
 from ident.hypotheses.drive import torque_saturation
 from ident.hypotheses.hinges import hinge_inertia
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
@@ -210,6 +211,16 @@ def test_a_decoy_that_holds_a_law_steps_back_behind_it_and_is_told_of(named):
 def test_a_power_of_the_speed_at_its_bounds_is_the_friction_of_the_catalogue(named):
     rising = named["unknown:rising_friction", "elbow_joint"]
     assert [pointless(Effect(rising, np.array([1.0, e, 1e-3])), 1e4) for e in (0.2, 0.4, 0.9)] == [True, False, True]
+
+
+def test_a_load_has_odds_over_a_body_only_where_that_is_clearly_off():
+    def odds_of(h, *p):
+        return odds(Candidate(h, SimpleNamespace(model=SimpleNamespace(effects=(Effect(h, np.array(p)),))), 0.0))
+
+    carrier = link_inertia("wrist_3_link", 5, carries_load=True)
+    assert odds_of(carrier, 1.3, 0.0, 0.0, 0.0, 1.0) == -LOAD_NATS
+    assert odds_of(carrier, 1.004, 0.0, 0.0, 0.0, 1.0) == 0.0
+    assert odds_of(link_inertia("forearm_link", 2), 1.3, 0.0, 0.0, 0.0, 1.0) == 0.0
 
 
 @pytest.mark.parametrize(
