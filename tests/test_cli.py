@@ -11,6 +11,8 @@ import pytest
 import ident
 from ident.dataset_io import save_dataset
 
+pytestmark = pytest.mark.xdist_group("cli")  # one worker makes what they share
+
 
 def simgap(*args, timeout=300):
     return subprocess.run(

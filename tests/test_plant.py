@@ -25,13 +25,13 @@ def run_of(plant):
 
 @pytest.mark.parametrize("hidden", [None, "backlash@shoulder_pan_joint:gap=8e-4"])
 def test_the_step_of_an_experiment_is_far_below_its_noise(ur10, hidden):
-    """Of a step a quarter as long the records differ by less than a fiftieth of the noise, at every joint."""
+    """Of a step half as long the records differ by less than a fiftieth of the noise, at every joint."""
     effects = [] if hidden is None else [parse_effect(hidden, ur10)]
     plan = small_plan(ur10, 3, points=1, validation_points=0, levels=(1.0,), period=1000)
     drives = draw_drives(np.random.default_rng(3), ur10)
     assert time_step(build_plant(ur10, effects, drives=drives), 1000.0) == pytest.approx(2.5e-4)
     coarse, fine = (
-        run_experiment(plan, effects, drives=drives, noise=0.0, timestep=h).segments for h in (None, 6.25e-5)
+        run_experiment(plan, effects, drives=drives, noise=0.0, timestep=h).segments for h in (None, 1.25e-4)
     )
     for a, b in zip(coarse, fine, strict=True):
         assert np.all(np.std(a.q - b.q, axis=0) < ur10.array("q_std") / 50.0)
