@@ -288,8 +288,8 @@ def by_link_encoders(
     )
     wide = set_up(dataset, fast=True)
     recorded = wide.problem.groups
-    known = {name: getattr(setup.problem, name) for name in ("q_std", "tau_std", "sampling")}
-    wide = replace(wide, problem=replace(with_link_encoders(wide.problem, late), **known))
+    both, told = with_link_encoders(wide.problem, late), setup.problem
+    wide = replace(wide, problem=replace(both, q_std=told.q_std, tau_std=told.tau_std, sampling=told.sampling))
     try:
         both = fit_baseline(wide.problem, workers.say)
         found = attribute(wide.problem, both, max_causes=max_causes, workers=workers.for_half())

@@ -23,6 +23,7 @@ ALIKE = 4.0  # the same of a joint from what all share
 SLACK = 0.25  # of the roll-off, by which a joint may differ beside that: its model is not exact
 LARGEST = 0.1  # sample times squared
 TELLING = 0.25  # share of what a joint leaves beyond noise, that its part of the roll-off must explain
+BY_CHANCE = 4.0  # fall of a cost by a number more, up to which noise brings it
 STEPS = 2  # from where a fit ends to where it ends with them
 
 
@@ -37,8 +38,7 @@ def with_roll_off(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
         sampling = problem.sampling
         problem = replace(problem, sampling=replace(sampling, roll_off=sampling.roll_off + more))
         result = renewed(problem, result)
-    before, after = (r.costs - r.counts for r in (first, result))
-    explained = after < (1.0 - TELLING) * before
+    explained = first.costs - result.costs > np.maximum(TELLING * (first.costs - first.counts), BY_CHANCE)
     return (problem, result) if 2 * np.sum(explained) > len(explained) else (start, first)
 
 

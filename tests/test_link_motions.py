@@ -1,6 +1,7 @@
 """Laws of the gear in motions, which link encoders show and the torque hardly does."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,11 +9,12 @@ import pytest
 from ident.conclude import _late
 from ident.coordinates import pack, unpack
 from ident.derivatives import jacobian
-from ident.diagnosis import diagnose, diagnose_fully
+from ident.diagnosis import by_link_encoders, diagnose, diagnose_fully
 from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.link_sensor import LinkDelay, comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect, Model
+from ident.parallel import Workers
 from ident.problem import data_count, data_counts, predictions
 from ident.weights import make_weights
 from sim.effects import parse_effect
@@ -70,6 +72,22 @@ def test_link_encoders_with_nothing_hidden_bring_no_cause(still):
 def linked(data, late=()):
     setup = set_up(data, fast=True)
     return replace(setup, problem=with_link_encoders(setup.problem, late))
+
+
+def test_torque_and_links_are_weighed_under_the_noise_that_the_torque_has_shown(still, monkeypatch):
+    setup = set_up(still)
+    told = replace(
+        setup.problem,
+        q_std=2.0 * setup.problem.q_std,
+        tau_std=0.1 * setup.problem.tau_std,
+        sampling=replace(setup.problem.sampling, roll_off=1e-7),
+    )
+    first = SimpleNamespace(model=Model(told.structure, told.nominal), remainders=[None] * len(told.groups))
+    monkeypatch.setattr("ident.diagnosis.fit_baseline", lambda problem, say: None)
+    monkeypatch.setattr("ident.diagnosis.attribute", lambda problem, both, **how: problem)
+    wide, _, _, asked = by_link_encoders(still, replace(setup, problem=told), first, 1, Workers())
+    assert asked is wide.problem and asked.sampling == told.sampling and asked.groups[0].links
+    assert np.array_equal(asked.q_std, told.q_std) and np.array_equal(asked.tau_std, told.tau_std)
 
 
 def test_links_move_with_the_drives_as_the_jacobian_says(still):
