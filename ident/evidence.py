@@ -182,7 +182,7 @@ def occam(candidate: Candidate, temper: float) -> float:
     amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in WAVE)) if is_wave(ps) else 0.0
     spread = np.array(
         [q.expected_spread(amplitude if q.name in WAVE else v) for q, v in zip(ps, effect.p, strict=True)]
-    )[~absent]
+    )[~absent] * options.get("of_size", lambda p: 1.0)(effect.p)
     narrowed = np.linalg.slogdet(np.eye(count) + own * np.outer(spread, spread) / temper)[1]
     density = sum(((v - q.prior_center(stiffness)) / q.spread) ** 2 for q, v in zip(ps, x, strict=True))
     return float(-0.5 * narrowed - 0.5 * density - nats)

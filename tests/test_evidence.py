@@ -1484,3 +1484,18 @@ def test_a_body_with_its_load_and_without_stay_in_a_contest():
         for h, c in ((bare, 10.2), (bare, 10.1), (loaded, 10.0), (load, 10.3), (load, 12.0))
     ]
     assert [(c.hypothesis, c.fit.cost) for c in best_of_each(ran)] == [(loaded, 10.0), (bare, 10.1), (load, 10.3)]
+
+
+def test_a_body_that_a_load_may_change_costs_no_more_where_it_changes_little(named):
+    """As a load does, which is expected to be as large as it is found."""
+    p, sharp = [1.001, 2e-4, 0.0, 0.0, 1.001], [1e9, 1e10, 0.0, 0.0, 1e9]
+    carrier, other = (
+        occam(candidate(link_inertia("wrist_3_link", 5, carries_load=c), p, sharp), TEMPER) for c in (True, False)
+    )
+    off = 0.002  # of what is expected of a mass, and of an inertia
+    assert carrier - other == pytest.approx(-3.0 * np.log(off), abs=0.02)
+    large = [1.3, *p[1:]]
+    carrier, other = (
+        occam(candidate(link_inertia("wrist_3_link", 5, carries_load=c), large, sharp), TEMPER) for c in (True, False)
+    )
+    assert carrier == other

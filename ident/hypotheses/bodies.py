@@ -17,6 +17,7 @@ from ident.motion import Solution
 
 LOAD_NATS = 2.0  # log odds of a load against a wrong last body: loads come and go
 EXACT = 0.01  # of the mass of that body, up to which no description is exact: a load of less has no odds over it
+SMALLEST_SIZE = 1e-6  # of a change of a body, over what is expected of one
 SMALL_LOAD = 0.03  # m, radius of gyration of a load from which its fit starts
 FARTHEST = 2.0  # m, of the centre of mass of a load
 LINK_STEPS = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)  # of mass, com and inertia of a link, for unit responses
@@ -89,8 +90,24 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_l
         with_load: whether the loads that the robot names on it are.
     """
 
+    parameters = (
+        Parameter("mass", "1", 0.05, 20.0, log=True, step=1e-4, center=1.0, spread=0.5, null=1.0),
+        Parameter("com_x", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
+        Parameter("com_y", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
+        Parameter("com_z", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
+        Parameter("inertia", "1", 0.02, 50.0, log=True, step=1e-3, center=1.0, spread=0.5, null=1.0),
+    )
+
     def how(p) -> LinkChange:
         return LinkChange(float(p[0]), (float(p[1]), float(p[2]), float(p[3])), float(p[4]), with_load)
+
+    def of_size(p) -> float:
+        """A load is expected to be as large as it is found; a change of a body that a load would make as well, and
+        that is no larger than that to which no description is exact, as large as that."""
+        if not carries_load or abs(p[0] - 1.0) > EXACT:
+            return 1.0
+        off = [(v - q.center) / q.spread for q, v in zip(parameters, p, strict=True)]
+        return float(np.clip(np.max(np.abs(off)), SMALLEST_SIZE, 1.0))
 
     def responses(structure, par, plane, group, solution, shape):
         joint, _ = structure.bodies[link]
@@ -107,13 +124,7 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_l
         link,
         joint_index,
         "model",
-        (
-            Parameter("mass", "1", 0.05, 20.0, log=True, step=1e-4, center=1.0, spread=0.5, null=1.0),
-            Parameter("com_x", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
-            Parameter("com_y", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
-            Parameter("com_z", "m", -1.0, 1.0, step=1e-4, center=0.0, spread=0.1, null=0.0),
-            Parameter("inertia", "1", 0.02, 50.0, log=True, step=1e-3, center=1.0, spread=0.5, null=1.0),
-        ),
+        parameters,
         None,
         lambda scale: [()],
         None,
@@ -124,6 +135,7 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_l
         options={
             "body": link,
             "nats": lambda p: -LOAD_NATS * (carries_load and abs(p[0] - 1.0) > EXACT),
+            "of_size": of_size,
             "with_load": with_load,
             "carries_load": carries_load,  # what it carries and its own body are one to the data
             "change": lambda p: Change(links=((link, how(p)),)),

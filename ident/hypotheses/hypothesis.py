@@ -132,7 +132,8 @@ class Hypothesis:
             stiffness. ``bends``: the arm may have several steady motions with it; ``bends(p, factor, stiffness)`` gives
             parameters of another size that do
             about the same. ``dry``: a friction that at rest balances what is asked of it.
-            ``nats(p)``: log odds before the data, where there is a reason for any. ``body``: the link whose inertia it
+            ``nats(p)``: log odds before the data, where there is a reason for any. ``of_size(p)``: factor of the spreads
+            that are expected of its parameters. ``body``: the link whose inertia it
             changes.
             ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a
             spring.
