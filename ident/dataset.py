@@ -95,7 +95,6 @@ class Dataset:
     """A set of recordings of one robot. ``robot.joints`` stand in the order of ``joints``."""
 
     name: str
-    robot_ref: str
     robot: Robot
     sample_rate: float
     joints: tuple[str, ...]

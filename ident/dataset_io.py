@@ -18,7 +18,7 @@ from ident.dataset import CHANNELS, Dataset, Filled, Segment
 from ident.outputs import take_place
 from ident.segment_file import read_segment
 from robot_assets.errors import DataError
-from robot_assets.robot import ASSETS, Robot, load_robot
+from robot_assets.robot import Robot, load_robot, robot_reference
 from robot_assets.values import choice, exists, number, read_toml, show, subtable, tables, text, vector, whole
 
 FORMAT = "simgap-dataset/1"
@@ -56,9 +56,9 @@ def load_dataset(path: str | Path) -> Dataset:
     if not 0 < len(entries) <= MAX_SEGMENTS:
         raise DataError("[[segment]]", where, f"{len(entries)} entries", f"1 to {MAX_SEGMENTS}")
     seen: dict[str, str] = {}
+    names: set[str] = set()
     return Dataset(
         name=str(head.get("name") or folder.resolve().name),
-        robot_ref=head["robot"],
         robot=robot,
         sample_rate=rate,
         joints=tuple(joints),
@@ -66,7 +66,7 @@ def load_dataset(path: str | Path) -> Dataset:
         q_std=levels["q_std"],
         tau_std=levels["tau_std"],
         controller=subtable(head, "controller", where) or None,
-        segments=tuple(_segment(e, i, folder, where, len(joints), rate, seen) for i, e in enumerate(entries)),
+        segments=tuple(_segment(e, i, folder, where, len(joints), rate, seen, names) for i, e in enumerate(entries)),
         path=folder,
     )
 
@@ -148,7 +148,7 @@ def _head(dataset: Dataset, target: Path) -> dict[str, Any]:
     head: dict[str, Any] = {
         "format": FORMAT,
         "name": dataset.name,
-        "robot": _robot_reference(dataset, target),
+        "robot": robot_reference(dataset.robot, target),
         "sample_rate": float(dataset.sample_rate),
         "joints": list(dataset.joints),
         "input_hold": dataset.input_hold,
@@ -181,14 +181,6 @@ def _head(dataset: Dataset, target: Path) -> dict[str, Any]:
     return head
 
 
-def _robot_reference(dataset: Dataset, target: Path) -> str:
-    """The robot as it is found from the folder written: a relative path is turned to it."""
-    ref = dataset.robot_ref
-    if Path(ref).is_absolute() or dataset.robot.folder.parent == ASSETS.resolve():
-        return ref
-    return Path(os.path.relpath(dataset.robot.folder, target.resolve())).as_posix()
-
-
 def _table(segment: Segment) -> pa.Table:
     columns: dict[str, np.ndarray] = {"t": segment.t}
     for channel in CHANNELS:
@@ -202,14 +194,17 @@ def _table(segment: Segment) -> pa.Table:
     return pa.table({k: np.ascontiguousarray(v, float) for k, v in columns.items()})
 
 
-def _segment(entry: dict, i: int, folder: Path, toml: str, n: int, rate: float, seen: dict[str, str]) -> Segment:
+def _segment(
+    entry: dict, i: int, folder: Path, toml: str, n: int, rate: float, seen: dict[str, str], names: set[str]
+) -> Segment:
     where = f"{toml} segment {i + 1}"
     file = text(entry, "file", where)
     path = _inside(folder, file, where)
-    name = Path(os.path.normpath(file)).with_suffix("").as_posix().replace("/", "-")
-    if name in seen:
-        raise DataError("file", where, f"{file} a second time (first as {seen[name]})", "each segment once")
-    seen[name] = file
+    real = os.path.normpath(file)
+    if real in seen:
+        raise DataError("file", where, f"{file} a second time (first as {seen[real]})", "each segment once")
+    seen[real], name = file, _name_of(Path(real), names)
+    names.add(name)
     kind = choice(entry, "kind", where, KINDS)
     role = choice(entry, "role", where, ROLES, "identification")
     t, channels = read_segment(path, where, n, rate)
@@ -245,6 +240,13 @@ def _segment(entry: dict, i: int, folder: Path, toml: str, n: int, rate: float, 
         realization=whole(entry, "realization", where, low=1, default=None),
         excited_lines=_lines(entry.get("excited_lines", []), period, where),
     )
+
+
+def _name_of(file: Path, taken: set[str]) -> str:
+    """Name of a segment by its file; by more of it where another has that name."""
+    first = file.with_suffix("").as_posix().replace("/", "-")
+    names = (first, f"{first}-{file.suffix[1:]}", *(f"{first}-{k}" for k in range(2, MAX_SEGMENTS + 2)))
+    return next(name for name in names if name not in taken)
 
 
 def _filled(entry: dict, where: str) -> Filled | None:

@@ -48,21 +48,25 @@ def estimate_distortion(dataset: Dataset, frf: FRF) -> Distortion:
 
 def _levels(segment, frf: FRF, point: int, sample_rate: float) -> np.ndarray:
     """Mean squares (4, n): excited torque, noise, even, odd."""
-    lines = np.arange(frf.lines[0], frf.lines[-1] + 1)
+    spacing = sample_rate / segment.period
+    first, last = (round(f / spacing, 6) for f in (frf.frequency[0], frf.frequency[-1]))
+    lines = np.arange(int(np.ceil(first)), int(last) + 1)
+    f = lines * spacing
     U = np.fft.rfft(segment.periodic("tau"), axis=1, norm="forward")[:, lines]
     Q = np.fft.rfft(segment.periodic("q"), axis=1, norm="forward")[:, lines]
-    w = 2 * np.pi * lines * sample_rate / segment.period
+    w = 2 * np.pi * f
     Z = np.linalg.inv(frf.G[point])
     flat = Z.reshape(len(frf.lines), -1)
     Zi = np.stack(
-        [np.interp(lines, frf.lines, c.real) + 1j * np.interp(lines, frf.lines, c.imag) for c in flat.T], axis=1
+        [np.interp(f, frf.frequency, c.real) + 1j * np.interp(f, frf.frequency, c.imag) for c in flat.T], axis=1
     ).reshape(len(lines), *Z.shape[1:])
     D = U - np.einsum("lij,plj->pli", Zi, Q * -(w**2)[:, None])
     P = len(D)
     mean = D.mean(axis=0)
     noise = np.sum(np.abs(D - mean) ** 2, axis=0) / (P * (P - 1)) if P > 1 else np.zeros_like(mean, float)
     excited = np.isin(lines, segment.excited_lines)
-    rows = [np.mean(np.abs(U.mean(axis=0)[excited]) ** 2, axis=0), noise.mean(axis=0)]
+    at_excited = np.abs(U.mean(axis=0)[excited]) ** 2
+    rows = [at_excited.mean(axis=0) if excited.any() else np.full(noise.shape[1], np.nan), noise.mean(axis=0)]
     for parity in (0, 1):
         mask = ~excited & (lines % 2 == parity)
         power = np.mean(np.abs(mean[mask]) ** 2 - noise[mask], axis=0) if mask.any() else np.zeros(mean.shape[1])

@@ -31,10 +31,12 @@ from ident.frf_basis import (
 )
 from ident.group import mean_over_lines
 from ident.local_frf import estimate_local
+from ident.recorded_noise import given_noise
 from robot_assets.errors import DataError
 
 ESTIMATORS = ("auto", "h1", "jio", "ari", "har", "log")
 LOCAL = ("lpm", "lrm")  # of ``ident.local_frf``
+NEAREST = 2 * SMOOTH + 1  # lines that nothing excites, over which the scatter of a single period is averaged
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def estimate_frf(
     Args:
         estimator: one of ``ESTIMATORS``; "auto" is JIO where a reference was recorded, else ARI. Or one
             of ``LOCAL``, for fewer experiments than inputs.
-        amplitude: level; the highest where None.
+        amplitude: level; of each point its highest where None.
 
     Raises:
         DataError: where nothing was recorded at that level, a point has fewer than n experiments or
@@ -65,18 +67,23 @@ def estimate_frf(
     if estimator in LOCAL:
         return estimate_local(dataset, method=estimator, role=role, amplitude=amplitude)
     points, level = choose_segments(dataset, role, amplitude)
-    chosen = [s for members in points.values() for s in members]
-    lines = common_lines(chosen, dataset)
-    frequency = lines * dataset.sample_rate / chosen[0].period
-    n = dataset.n
-    blocks = [_blocks(members, lines, frequency, n, name) for name, members in points.items()]
+    lines = common_lines(points, dataset)
+    periods = [members[0].period for members in points.values()]
+    first = lines[next(iter(points))]
+    frequency, n = first * dataset.sample_rate / periods[0], dataset.n
+    blocks = [_blocks(members, lines[name], frequency, n, name) for name, members in points.items()]
     without = [name for name, b in zip(points, blocks, strict=True) if b.R is None]
     if estimator == "jio" and without:
         raise DataError("r", f"operating point {without[0]}", "no reference of full rank", "r columns, which JIO needs")
     kind = estimator if estimator != "auto" else ("ari" if without else "jio")
     results = [average(b, kind) for b in blocks]
-    power = sample_noise_power(dataset, chosen[0].period, frequency)
-    spreads = [_covariance(b, G, kind, power) for b, G in zip(blocks, results, strict=True)]
+    powers = [sample_noise_power(dataset, period, frequency) for period in periods]
+    unsaid = any(given_noise(dataset, channel) is None for channel in ("q", "tau"))
+    scatters = [
+        _unexcited_scatter(members, lines[name], G, dataset) if unsaid else None
+        for (name, members), G in zip(points.items(), results, strict=True)
+    ]
+    spreads = [_covariance(b, G, kind, *x) for b, G, *x in zip(blocks, results, powers, scatters, strict=True)]
     diag = [tuple(unvec(np.einsum("fii->fi", c).real, n) for c in pair) for pair in spreads]
     return FRF(
         G=np.stack(results),
@@ -84,7 +91,7 @@ def estimate_frf(
         noise_std=np.sqrt(np.stack([d[0] for d in diag])),
         total_std=np.sqrt(np.stack([d[1] for d in diag])),
         frequency=frequency,
-        lines=lines,
+        lines=first,
         operating_points=tuple(points),
         q0=np.stack([np.mean([s.periodic("q").mean(axis=(0, 1)) for s in m], axis=0) for m in points.values()]),
         amplitude=level,
@@ -165,8 +172,50 @@ def experiment_sets(members: Sequence[Segment], n: int) -> list[dict[int, Segmen
     return list(sets.values())
 
 
+def _unexcited_scatter(
+    members: Sequence[Segment], lines: np.ndarray, G: np.ndarray, dataset: Dataset
+) -> np.ndarray | None:
+    """Covariance (F, n, n) of ``E = Y - G U`` in a line of one period, by those that nothing excites about each of
+    ``lines``: noise, and distortion with it. None where there are too few of them.
+
+    G is interpolated between excited lines, and over a window the scatter follows the noise of the samples.
+    """
+    excited = np.unique(np.concatenate([s.excited_lines for s in members]))
+    free = np.setdiff1d(np.arange(lines[0], lines[-1] + 1), excited)
+    if len(free) < NEAREST:
+        return None
+    period = members[0].period
+    spacing = dataset.sample_rate / period
+    flat = G.reshape(len(lines), -1).T
+    between = np.stack([np.interp(free, lines, c.real) + 1j * np.interp(free, lines, c.imag) for c in flat], axis=1)
+    between = between.reshape(len(free), *G.shape[1:])
+    E = []
+    for s in members:
+        U, Q = (np.fft.rfft(s.periodic(c), axis=1, norm="forward")[:, free] for c in ("tau", "q"))
+        E.append(-((2 * np.pi * spacing * free[:, None]) ** 2) * Q - np.einsum("lij,plj->pli", between, U))
+    E = np.concatenate(E)
+    shapes = [
+        np.sqrt(np.einsum("fii->fi", _sample_noise(H, *sample_noise_power(dataset, period, spacing * k))).real)
+        for H, k in ((between, free), (G, lines))
+    ]
+    E = E / np.maximum(shapes[0], 1e-300)
+    each = np.einsum("sli,slk->lik", E, E.conj()) / len(E)
+    first = np.clip(np.searchsorted(free, lines) - NEAREST // 2, 0, len(free) - NEAREST)
+    relative = each[first[:, None] + np.arange(NEAREST)].mean(axis=1)
+    return shapes[1][:, :, None] * relative * shapes[1][:, None, :]
+
+
+def _sample_noise(G: np.ndarray, torque: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
+    """Covariance (F, n, n) of ``E = Y - G U`` by powers (F, n) of noise of the samples of U and Y."""
+    return (G * torque[:, None, :]) @ np.conj(np.swapaxes(G, -1, -2)) + acceleration[:, :, None] * np.eye(G.shape[1])
+
+
 def _covariance(
-    blocks: Blocks, G: np.ndarray, estimator: str = "ari", sample_power: tuple[np.ndarray, np.ndarray] | None = None
+    blocks: Blocks,
+    G: np.ndarray,
+    estimator: str = "ari",
+    sample_power: tuple[np.ndarray, np.ndarray] | None = None,
+    scatter: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Noise and total covariance of vec G, each (F, n n, n n).
 
@@ -183,12 +232,12 @@ def _covariance(
         sample_power: (F, n) power of torque and acceleration noise in a line of one period: the
             covariance where there is neither a second period nor a second realization, else the
             shape over frequency about which it is smoothed.
+        scatter: (F, n, n) covariance of ``E`` in a line of one period, in place of that of the samples' noise.
     """
     M, P, F, n, _ = blocks.U.shape
     expected, shape = None, np.ones((F, n))
     if sample_power is not None:
-        u, y = sample_power
-        expected = (G * u[:, None, :]) @ np.conj(np.swapaxes(G, -1, -2)) + y[:, :, None] * np.eye(n)
+        expected = _sample_noise(G, *sample_power)
         shape = np.maximum(np.einsum("fii->fi", expected).real, 1e-300)
     A = _gains(blocks, estimator)
     K = np.einsum("mfej,mfel->fjl", A, A.conj(), optimize=True)
@@ -199,7 +248,7 @@ def _covariance(
         dof = M * n * (P - 1)
         noise = steadied(np.einsum("mpfie,mpfke->fik", d, d.conj(), optimize=True) / (P * dof), dof, shape)
     elif M < 2:
-        noise = expected
+        noise = expected if scatter is None else scatter
     total = noise
     if M > 1:
         e = E.mean(axis=1)

@@ -4,12 +4,14 @@ lines."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 from scipy.special import digamma
 
 from ident.dataset import Dataset, Segment
 from ident.group import mean_over_lines
+from ident.recorded_noise import given_noise, noise_of
 from robot_assets.errors import DataError
 
 SMOOTH = 3  # lines on either side over which a covariance of few degrees of freedom is smoothed
@@ -25,11 +27,11 @@ class FRF:
         covariance: (Q, F, n n, n n) of vec G, columns stacked; of the estimate, not of one period.
         noise_std: (Q, F, n, n) standard deviation by measurement noise alone.
         total_std: (Q, F, n, n) with stochastic nonlinear distortion where realizations show it.
-        frequency: (F,) Hz. lines: (F,).
+        frequency: (F,) Hz. lines: (F,), of the period of the first point.
         operating_points: names. q0: (Q, n) rad, mean motor position.
-        amplitude: relative level. realizations, periods: averaged; the fewest of all points.
+        amplitude: relative level, the highest of all points. realizations, periods: averaged; the fewest of all points.
         estimator: of ``ESTIMATORS`` or ``LOCAL``.
-        not_used: segments of that level in sets of fewer than n experiments, beside sets that are complete.
+        not_used: segments of these levels in sets of fewer than n experiments, beside sets that are complete.
     """
 
     G: np.ndarray
@@ -55,7 +57,9 @@ def frf_levels(dataset: Dataset, *, role: str = "identification") -> tuple[float
 def choose_segments(
     dataset: Dataset, role: str, amplitude: float | None = None
 ) -> tuple[dict[str, list[Segment]], float]:
-    """Multisine segments of a role at one level, by operating point, and that level; the highest where None.
+    """Multisine segments of a role at one level, by operating point, and that level.
+
+    Where None, of each point those at its highest, and the highest of all.
 
     Raises:
         DataError: where there are none.
@@ -68,11 +72,14 @@ def choose_segments(
         )
     if not segments:
         raise DataError("multisine segments", dataset.name, f"none of role {role}", "at least n per operating point")
-    level = max(s.amplitude for s in segments) if amplitude is None else amplitude
     points: dict[str, list[Segment]] = {}
     for s in segments:
-        if np.isclose(s.amplitude, level):
-            points.setdefault(str(s.operating_point), []).append(s)
+        points.setdefault(str(s.operating_point), []).append(s)
+    highest = {name: max(s.amplitude for s in members) for name, members in points.items()}
+    level = max(highest.values()) if amplitude is None else amplitude
+    wanted = highest if amplitude is None else dict.fromkeys(points, amplitude)
+    at_level = {name: [s for s in members if np.isclose(s.amplitude, wanted[name])] for name, members in points.items()}
+    points = {name: members for name, members in at_level.items() if members}
     if not points:
         raise DataError("amplitude", dataset.name, f"{level:g}", f"one of {frf_levels(dataset, role=role)}")
     return points, float(level)
@@ -84,28 +91,30 @@ def _periodic(dataset: Dataset, role: str) -> list[Segment]:
 
 def sample_noise_power(dataset: Dataset, period: int, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Power (F, n) that white sample noise leaves in a line of torque and of acceleration."""
-    robot = dataset.robot
-    tau = np.asarray(robot.array("tau_std") if dataset.tau_std is None else dataset.tau_std, float)
-    q = np.asarray(robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
+    known = {channel: given_noise(dataset, channel) for channel in ("q", "tau")}
+    q, tau = (noise_of(dataset, channel) if given is None else given for channel, given in known.items())
     one = np.ones((len(frequency), 1))
     return one * tau**2 / period, (2 * np.pi * frequency[:, None]) ** 4 * q**2 / period
 
 
-def common_lines(segments: list[Segment], dataset: Dataset) -> np.ndarray:
-    """Excited lines that all segments share; (F,) int, sorted.
+def common_lines(points: dict[str, list[Segment]], dataset: Dataset) -> dict[str, np.ndarray]:
+    """Excited lines (F,) int, sorted, of each operating point, at the frequencies that all segments share.
 
     Raises:
-        DataError: where periods differ or no line is shared.
+        DataError: where periods of one point differ or no frequency is shared.
     """
-    first = segments[0]
-    lines = np.asarray(first.excited_lines, int)
-    for s in segments:
-        if s.period != first.period:
-            raise DataError("period", s.name, str(s.period), f"{first.period} as in {first.name}")
-        lines = np.intersect1d(lines, s.excited_lines)
-    if not len(lines):
-        raise DataError("excited_lines", dataset.name, "no line that all segments share", "a common grid")
-    return lines
+    shared = None
+    for members in points.values():
+        first = members[0]
+        for s in members:
+            if s.period != first.period:
+                raise DataError("period", s.name, str(s.period), f"{first.period} as in {first.name}")
+            frequencies = {Fraction(int(k), int(first.period)) for k in s.excited_lines}
+            shared = frequencies if shared is None else shared & frequencies
+    if not shared:
+        found, wanted = "no frequency that all segments share", "a common grid (`identify --estimator ml` needs none)"
+        raise DataError("excited_lines", dataset.name, found, wanted)
+    return {name: np.array([int(f * members[0].period) for f in sorted(shared)]) for name, members in points.items()}
 
 
 def kron_by_line(K: np.ndarray, Phi: np.ndarray) -> np.ndarray:

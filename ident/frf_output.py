@@ -35,7 +35,7 @@ def write_frf(dataset: Dataset, out: str | Path, estimator: str = "auto") -> dic
         "distortion_N_m": {
             kind: {
                 joint: {
-                    f"level {a:g}": float(np.nanmean(getattr(distortion, kind)[:, i, j]))
+                    f"level {a:g}": _mean_of_known(getattr(distortion, kind)[:, i, j])
                     for i, a in enumerate(distortion.levels)
                 }
                 for j, joint in enumerate(dataset.joints)
@@ -56,3 +56,9 @@ def write_frf(dataset: Dataset, out: str | Path, estimator: str = "auto") -> dic
         )
         (folder / "frf.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     return summary
+
+
+def _mean_of_known(x: np.ndarray) -> float | None:
+    """Mean over the operating points that know it; None, which JSON can say, where none does."""
+    known = x[np.isfinite(x)]
+    return float(known.mean()) if len(known) else None

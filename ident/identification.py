@@ -28,9 +28,9 @@ from ident.noise import (
 from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps, with_rounding
+from ident.recorded_noise import declared_position_noise, given_noise, least_noise, noise_of, recorded_noise
 from ident.records import build_groups
 from ident.refits import FAINT, under_own_noise
-from ident.rest import difference_noise
 from ident.roll_off import with_roll_off
 from ident.swings import without_swings
 from ident.torque_fit import Fit
@@ -39,7 +39,6 @@ from robot_assets.errors import DataError
 MOTION_BAND_HZ = 10.0  # highest compared frequency of motions, at most
 MOTION_SHARE = 0.4  # the same, in units of the lowest mode of the links
 POSTURES = 8  # of a motion at which modes are looked at
-LEAST_NOISE = {"q": 1e-7, "tau": 1e-3}  # over the signal, where differences of samples show less: filtered records
 RENEWALS = 3  # at most, of such noise
 LOUD = 2.0  # power of noise as it was guessed, over that which is found, from which it is lowered
 SLOW_LINES = 2.0  # power left at all lines of motions over that at the fast ones, up to which both are noise
@@ -74,7 +73,7 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     told = replace(dataset, segments=tuple(s for s in dataset.segments if s.name not in ran_away))
     if told.select(role="validation"):
         held_out = build_groups(told, role="validation", motion_band_hz=band, fast=fast)
-    q_std, tau_std = _noise(dataset)
+    q_std, tau_std = recorded_noise(dataset)
     declared = declared_position_noise(dataset)
     steps = find_steps(dataset, declared) if np.all(declared > 0) else ()
     compared, held_out = (with_rounding(x, steps, dataset) for x in (multisines or groups, held_out))
@@ -99,11 +98,6 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
             "positions", dataset.name, "no joint that moves beyond its noise", "motion that the drives bring about"
         )
     return Setup(problem, held_out, steps, ran_away)
-
-
-def declared_position_noise(dataset: Dataset) -> np.ndarray:
-    """(n,) sample noise of the positions by the dataset, else by its robot; rad."""
-    return np.asarray(dataset.robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
 
 
 def runaways(dataset: Dataset) -> tuple[str, ...]:
@@ -135,39 +129,6 @@ def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) 
             squares = np.linalg.eigvals(np.linalg.solve(lin.M, K)).real
             lowest = min(lowest, *np.sqrt(squares[squares > 0]) / 2 / np.pi, np.inf)
     return float(min(MOTION_BAND_HZ, dataset.sample_rate / 10, MOTION_SHARE * lowest))
-
-
-def _noise(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Sample noise of position and torque: as given, else from fourth differences of the identification segments.
-
-    A torque that is not held from sample to sample may be made by a faster loop, of which the record holds single
-    samples: what circulates there folds into all lines, and is noise beside that which is given.
-    """
-    return _noise_of(dataset, "q"), _noise_of(dataset, "tau")
-
-
-def _noise_of(dataset: Dataset, channel: str) -> np.ndarray:
-    given = given_noise(dataset, channel)
-    if given is not None and (channel == "q" or dataset.input_hold == "zoh"):
-        return given
-    each = np.median([difference_noise(getattr(s, channel)) for s in dataset.select(role="identification")], axis=0)
-    return np.maximum(each, least_noise(dataset, channel))
-
-
-def given_noise(dataset: Dataset, channel: str) -> np.ndarray | None:
-    """(n,) noise of the samples of a channel that the dataset gives, rad or N m; None where it does not."""
-    given = dataset.q_std if channel == "q" else dataset.tau_std
-    return np.asarray(given, float) if given is not None and np.all(given > 0) else None
-
-
-def least_noise(dataset: Dataset, channel: str) -> np.ndarray:
-    """(n,) noise of the samples of a channel that is taken at least, rad or N m: as given, else a small share of its
-    signal."""
-    given = given_noise(dataset, channel)
-    if given is not None:
-        return given
-    size = np.median([np.std(getattr(s, channel), axis=0) for s in dataset.select(role="identification")], axis=0)
-    return np.maximum(LEAST_NOISE[channel] * size, 1e-9 if channel == "q" else 1e-6)
 
 
 @one_thread_each
@@ -267,7 +228,7 @@ def under_noise_beside_causes(
     A ripple of the gear shows at those lines as at the others, and looks like noise as long as it is missing.
     """
     problem, first = setup.problem, result
-    q_std, tau_std = _noise(dataset)
+    q_std, tau_std = recorded_noise(dataset)
     raised = np.any(problem.q_std > q_std) and not any(g.shows_noise for g in problem.groups)
     if raised and guessed_noise(dataset)[0]:
         guess = replace(problem, q_std=np.minimum(problem.q_std, q_std), tau_std=np.minimum(problem.tau_std, tau_std))
@@ -283,7 +244,7 @@ def under_noise_beside_causes(
 def guessed_noise(dataset: Dataset) -> list[bool]:
     """Whether the noise of position and of torque are not given, or as ``_noise`` says not all that there is."""
     q_std, tau_std = (given_noise(dataset, channel) for channel in ("q", "tau"))
-    return [q_std is None, tau_std is None or bool(np.any(_noise_of(dataset, "tau") > np.sqrt(LOUD) * tau_std))]
+    return [q_std is None, tau_std is None or bool(np.any(noise_of(dataset, "tau") > np.sqrt(LOUD) * tau_std))]
 
 
 def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> Problem:

@@ -82,7 +82,7 @@ def estimate_local(
 
     Args:
         method: of ``METHODS``.
-        amplitude: level; the highest where None.
+        amplitude: level; of each point its highest where None.
         order: of the polynomials. poles: of the denominator (LRM).
         half_width: excited lines on either side of a centre; as few as leave ``SPARE`` degrees of
             freedom beyond n where None.
@@ -100,7 +100,9 @@ def estimate_local(
     for s in chosen:
         if s.r is None:
             raise DataError("r", s.name, "no reference", "r columns, which local methods need")
-    n, lines = dataset.n, common_lines(chosen, dataset)
+    if len({s.period for s in chosen}) > 1:
+        raise DataError("period", dataset.name, "several", "one, which local methods need")
+    n, lines = dataset.n, common_lines(points, dataset)[next(iter(points))]
     poles = poles if method == "lrm" else 0
     E = min(len(members) for members in points.values())
     P = min(int(s.periods or 0) for s in chosen)

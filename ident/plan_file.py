@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from ident.excitation import Excitation
 from ident.plan import INJECTIONS, Experiment, Plan, Trajectory, check_size
 from robot_assets.errors import DataError
-from robot_assets.robot import ASSETS, Robot, load_robot
+from robot_assets.robot import Robot, load_robot, robot_reference
 from robot_assets.values import choice, number, read_toml, tables, text, vector, whole
 
 PLAN_FORMAT = "simgap-plan/1"
@@ -34,10 +34,9 @@ def plan_to_toml(plan: Plan, path: str | Path) -> None:
     for m in plan.trajectories:
         points = m.q_ref[_knots(len(m.q_ref))].round(12).tolist()
         motions.append({"name": m.name, "role": m.role, "samples": len(m.q_ref), "q_ref": points})
-    known = plan.robot.folder.parent == ASSETS.resolve()
     head = {
         "format": PLAN_FORMAT,
-        "robot": plan.robot.folder.name if known else str(plan.robot.folder),
+        "robot": robot_reference(plan.robot, target.parent),
         "injection": plan.injection,
         "seed": plan.seed,
         "sample_rate": float(x.sample_rate),

@@ -20,6 +20,7 @@ from ident.chain import Structure
 from ident.dataset import Dataset
 from ident.frf_basis import choose_segments
 from ident.graybox import Parameters, parameter_names
+from ident.recorded_noise import noise_of
 from robot_assets.errors import DataError
 
 PROMISE = 1e-3  # fall of -2 log L that a step promises at which a fit is done: far below one standard deviation
@@ -118,7 +119,7 @@ def runs_of(dataset: Dataset, *, role: str = "identification", amplitude: float 
     y, q0 = np.stack([s.q for s in chosen]), np.stack([m[0].q0 for m in points.values()])
     point = np.repeat(np.arange(len(points)), [len(m) for m in points.values()])
     skip = first.transient_periods * first.period
-    noise = np.asarray(dataset.robot.array("q_std") if dataset.q_std is None else dataset.q_std, float)
+    noise = noise_of(dataset, "q")
     spread = spread_at_start(y - q0[point][:, None], noise, 1.0 / dataset.sample_rate)
     if spread is not None:
         skip = max(skip, first.period)

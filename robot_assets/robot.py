@@ -6,6 +6,7 @@ All drive figures are referred to the link side of the gear.
 
 from __future__ import annotations
 
+import os
 import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,15 @@ from robot_assets.urdf import Description, read_urdf
 from robot_assets.values import MISSING, exists, number, read_toml, show, subtable, tables, text, vector
 
 ASSETS = Path(__file__).parent
+# Figures of a joint by other names that they go by.
+OTHER_NAMES = {
+    "damping": ("spring_damping",),
+    "viscous_friction": ("motor_viscous_friction",),
+    "torque_limit": ("torque_max", "effort_limit"),
+    "velocity_limit": ("velocity_max",),
+    "q_std": ("q_noise_std",),
+    "tau_std": ("tau_noise_std",),
+}
 # Guesses of what a robot.toml may leave out; by whether a joint is linear.
 WINDUP = 1 / 150  # rad: how far a gear winds up under the torque limit
 VELOCITY = {False: np.pi, True: 1.0}  # velocity limit where the URDF has none, rad/s or m/s
@@ -136,7 +146,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
             raise DataError("joint", where, name, f"a movable joint of {urdf.name}: {sorted(tree.limits)}")
     hinges = tuple(_elasticity(e, where, names) for e in tables(data, "elasticity", where))
     _distinct([h.name for h in hinges], "[[elasticity]] names", where)
-    payload_link = data.get("payload_link", tree.child[names[-1]])
+    payload_link = data.get("payload_link", data.get("flange", tree.child[names[-1]]))
     if not isinstance(payload_link, str) or (payload_link and payload_link not in tree.links):
         raise DataError("payload_link", where, show(payload_link), f"a link of {urdf.name}")
     gx, gy, gz = vector(data.get("gravity", [0, 0, -9.81]), "gravity", where, 3)
@@ -167,6 +177,13 @@ def linear_joints(robot: Robot) -> np.ndarray:
     """(n,) whether a joint is linear: its figures are in kg, N and m for kg m2, N m and rad."""
     kinds = read_urdf(robot.urdf).kinds
     return np.array([kinds[name] == "prismatic" for name in robot.joint_names])
+
+
+def robot_reference(robot: Robot, folder: Path) -> str:
+    """A robot as a file in a folder names it: one of ``ASSETS``, or by its path from there."""
+    if robot.folder.parent == ASSETS.resolve():
+        return robot.folder.name
+    return Path(os.path.relpath(robot.folder, folder.resolve())).as_posix()
 
 
 def _folder(name_or_path: str | Path, relative_to: Path | None) -> Path:
@@ -212,7 +229,10 @@ def _joint(entry: dict, i: int, where: str, tree: Description) -> Joint:
     where, linear = f"{where} joint {name}", tree.kinds.get(name) == "prismatic"
 
     def figure(key: str, default: Any = MISSING) -> float:
-        return number(entry, key, where, low=0.0, above=True, default=default)
+        used = [name for name in (key, *OTHER_NAMES.get(key, ())) if name in entry]
+        if len(used) > 1:
+            raise DataError(used[1], where, f"{used[0]} beside it", "one of the two: they are the same")
+        return number(entry, used[0] if used else key, where, low=0.0, above=True, default=default)
 
     stiffness = figure("stiffness")
     torque_limit = figure("torque_limit", tree.efforts.get(name) or WINDUP * stiffness)

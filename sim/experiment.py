@@ -63,10 +63,12 @@ def run_experiment(
         drives: true drive figures; nominal where None.
         noise: factor on the noise of ``robot.toml``.
         timestep: s, of MuJoCo; a whole fraction of the sample time. ``time_step`` of the arm where None.
+        link_encoders: whether they are recorded; they are where an effect sits in one.
 
     Raises:
         DataError: where the loop diverges, or the step does not divide the sample time.
     """
+    link_encoders = link_encoders or in_link_encoder(effects)
     rng = np.random.default_rng(seed)
     plant = plant_for(plan, effects, drives, timestep, integrator)
     levels = noise_levels(plan.robot, noise)
@@ -85,12 +87,16 @@ def run_experiment(
     return as_dataset(plan, segments, name)
 
 
+def in_link_encoder(effects: Sequence) -> bool:
+    """Whether an effect would leave no trace without link encoders."""
+    return any(getattr(e, "channel", None) == "q_link" for e in effects)
+
+
 def as_dataset(plan: Plan, segments: Sequence[Segment], name: str) -> Dataset:
     """Segments recorded on the plant as a dataset."""
     robot = plan.robot
     return Dataset(
         name=name,
-        robot_ref=_reference(robot),
         robot=robot,
         sample_rate=plan.excitation.sample_rate,
         joints=robot.joint_names,
@@ -129,12 +135,6 @@ def noise_levels(robot: Robot, factor: float) -> Noise:
     """The noise of ``robot.toml`` times a factor."""
     q, tau = factor * robot.array("q_std"), factor * robot.array("tau_std")
     return Noise(q, tau, PROCESS_SHARE * tau)
-
-
-def _reference(robot: Robot) -> str:
-    from robot_assets.robot import ASSETS
-
-    return robot.name if (ASSETS / robot.name).resolve() == robot.folder else str(robot.folder)
 
 
 def loop_gains(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from ident.dataset import Dataset, Segment
 from ident.plan import Schedule
 from robot_assets.errors import DataError
-from sim.experiment import as_dataset, loop_gains, noise_levels, plant_for
+from sim.experiment import as_dataset, in_link_encoder, loop_gains, noise_levels, plant_for
 from sim.loop import Controller, failed, run_loop
 from sim.plant import Plant, link_inertia_diagonal, rest
 
@@ -43,6 +43,7 @@ def run_recording(
     Raises:
         DataError: where the loop diverges, or the step does not divide the sample time.
     """
+    link_encoders = link_encoders or in_link_encoder(effects)
     plan = schedule.plan
     rate = plan.excitation.sample_rate
     plant = plant_for(plan, effects, drives, timestep, integrator)

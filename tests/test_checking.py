@@ -54,7 +54,7 @@ def motion(t, seed, robot):
 
 
 def dataset(robot, *segments):
-    return Dataset("d", robot.name, robot, RATE, robot.joint_names, "none", None, None, None, segments)
+    return Dataset("d", robot, RATE, robot.joint_names, "none", None, None, None, segments)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """Dataset files: round trip, and one clear error for everything that breaks the format."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
 from robot_assets.errors import DataError
+from robot_assets.robot import load_robot
 
 
 @pytest.fixture
@@ -37,7 +39,6 @@ def folder(tmp_path, ur10):
     motion = Segment(name="b", kind="trajectory", tau=rng.normal(size=(N, n)), q=rng.normal(size=(N, n)), **common)
     data = Dataset(
         "small",
-        "ur10",
         ur10,
         1000.0,
         ur10.joint_names,
@@ -199,3 +200,29 @@ def test_a_failing_save_harms_no_earlier_dataset(folder):
         save_dataset(broken, path)
     assert len(load_dataset(path).segments) == 2
     assert not [p for p in path.parent.iterdir() if p.name.startswith(".")]
+
+
+def test_files_of_one_name_are_segments_of_their_own(folder):
+    path, data = folder
+    (path / "b").mkdir()
+    shutil.copy(path / "b.parquet", path / "b" / "c.parquet")
+    shutil.copy(path / "b.parquet", path / "b-c.parquet")
+    pa.csv.write_csv(pq.read_table(path / "b.parquet"), path / "b.csv")
+    more = "".join(
+        f'[[segment]]\nfile = "{file}"\nkind = "trajectory"\n' for file in ("b.csv", "b/c.parquet", "b-c.parquet")
+    )
+    (path / "dataset.toml").write_text((path / "dataset.toml").read_text() + more)
+    again = load_dataset(path)
+    assert [s.name for s in again.segments] == ["a", "b", "b-csv", "b-c", "b-c-parquet"]
+    assert all(np.allclose(s.q, data.segments[1].q) for s in again.segments[1:])
+
+
+def test_a_robot_of_the_users_own_is_found_from_the_dataset_wherever_both_are(folder, ur10, tmp_path):
+    _, data = folder
+    shutil.copytree(ur10.folder, tmp_path / "lab" / "arms" / "mine")
+    mine = replace(data, robot=load_robot(tmp_path / "lab" / "arms" / "mine"))
+    save_dataset(mine, tmp_path / "lab" / "run" / "d")
+    assert 'robot = "../../arms/mine"' in (tmp_path / "lab" / "run" / "d" / "dataset.toml").read_text()
+    shutil.move(tmp_path / "lab", tmp_path / "elsewhere")
+    there = tmp_path / "elsewhere"
+    assert load_dataset(there / "run" / "d").robot.folder == (there / "arms" / "mine").resolve()

@@ -661,17 +661,17 @@ def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
 
 
 def test_a_filtered_record_is_not_taken_for_a_noiseless_one(clean):
-    from ident.identification import LEAST_NOISE, _noise
+    from ident.recorded_noise import LEAST_NOISE, recorded_noise
 
     data = clean[0]
     t = np.arange(len(data.segments[0].t))[:, None] / data.sample_rate
     smooth = np.sin(2 * np.pi * (0.3 + 0.1 * np.arange(6)) * t)
     segment = replace(data.segments[0], q=smooth, tau=50.0 * smooth)
-    _, tau_std = _noise(replace(data, segments=(segment,), q_std=None, tau_std=None))
+    _, tau_std = recorded_noise(replace(data, segments=(segment,), q_std=None, tau_std=None))
     assert np.allclose(tau_std, LEAST_NOISE["tau"] * segment.tau.std(axis=0))
     rough = np.random.default_rng(0).normal(size=smooth.shape)
     noisy = replace(segment, tau=segment.tau + rough)
-    assert _noise(replace(data, segments=(noisy,), q_std=None, tau_std=None))[1] == pytest.approx(1.0, rel=0.1)
+    assert recorded_noise(replace(data, segments=(noisy,), q_std=None, tau_std=None))[1] == pytest.approx(1.0, rel=0.1)
 
 
 @pytest.mark.parametrize(("wound_up", "limit"), [(False, 12.0), (True, 3.0)])

@@ -106,8 +106,8 @@ def test_realizations_lower_the_error_by_their_root():
     assert rms(16) / rms(4) == pytest.approx(0.5, rel=0.15)
 
 
-RATE, PERIOD = 500.0, 500
-LINES = np.arange(3, 80, 4)
+RATE, SHORTEST = 500.0, 500
+GRID = np.arange(3, 80, 4)
 
 
 def rigid(n):
@@ -115,16 +115,32 @@ def rigid(n):
     return np.linalg.inv(np.diag(1.0 + np.arange(n)) + 0.2)
 
 
-def recorded(robot, n, *, M=1, P=2, levels=(1.0,), skip=(), reference=True, noise=1.0, disturbance=0.0, seed=0):
-    """(dataset, even-line disturbance rms (n,)): ``A q = u - d``, ``u = r - K q``, white sample noise."""
+def recorded(
+    robot,
+    n,
+    *,
+    M=1,
+    P=2,
+    levels=(1.0,),
+    skip=(),
+    reference=True,
+    noise=1.0,
+    disturbance=0.0,
+    seed=0,
+    longer=1,
+    point="p",
+):
+    """(dataset, even-line disturbance rms (n,)): ``A q = u - d``, ``u = r - K q``, white sample noise; in periods that
+    are ``longer`` by a whole number."""
     rng = np.random.default_rng(seed)
     robot = replace(robot, joints=robot.joints[:n])
     q_std, tau_std = noise * 1e-5 * np.ones(n), noise * 1e-3 * np.ones(n)
+    PERIOD, LINES = longer * SHORTEST, longer * GRID
     w = 2 * np.pi * np.arange(PERIOD // 2 + 1) * RATE / PERIOD
     A = -(w**2)[:, None, None] * np.linalg.inv(rigid(n))
     closed = np.linalg.inv(A + 3e3 * np.eye(n))
     T = np.exp(2j * np.pi * np.outer(np.arange(n), np.arange(n)) / n)
-    even = np.arange(4, 80, 2)
+    even = np.arange(4, 80, 2) * longer
     d = np.zeros((len(w), n), complex)
     d[even] = disturbance * np.exp(2j * np.pi * rng.random((len(even), n)))
     segments = []
@@ -148,7 +164,7 @@ def recorded(robot, n, *, M=1, P=2, levels=(1.0,), skip=(), reference=True, nois
                         tau=time[0] + tau_std * rng.normal(size=time[0].shape),
                         q=time[1] + q_std * rng.normal(size=time[0].shape),
                         r=time[2] if reference else None,
-                        operating_point="p",
+                        operating_point=point,
                         period=PERIOD,
                         periods=P,
                         experiment=e + 1,
@@ -158,7 +174,7 @@ def recorded(robot, n, *, M=1, P=2, levels=(1.0,), skip=(), reference=True, nois
                     )
                 )
     joints = tuple(robot.joint_names)
-    data = Dataset("loop", robot.name, robot, RATE, joints, "none", q_std, tau_std, None, tuple(segments))
+    data = Dataset("loop", robot, RATE, joints, "none", q_std, tau_std, None, tuple(segments))
     return data, np.full(n, disturbance)
 
 
@@ -177,9 +193,9 @@ def test_recordings_of_any_shape_give_the_arm_and_an_honest_deviation(ur10, n, M
         errors.append(np.abs(frf.G[0] - rigid(n)) ** 2)
         claimed.append(frf.total_std[0] ** 2)
         assert np.median(np.abs(frf.G[0] - rigid(n))) < 0.05
-    assert frf.G.shape == (1, len(LINES), n, n) and frf.covariance.shape == (1, len(LINES), n * n, n * n)
+    assert frf.G.shape == (1, len(GRID), n, n) and frf.covariance.shape == (1, len(GRID), n * n, n * n)
     assert (frf.estimator, frf.realizations, frf.periods) == ("jio" if reference else "ari", M, P)
-    assert np.allclose(frf.frequency, LINES * RATE / PERIOD)
+    assert np.allclose(frf.frequency, GRID * RATE / SHORTEST)
     ratio = np.mean(errors, axis=0) / np.mean(claimed, axis=0)
     for part in np.array_split(ratio, 3):
         assert 0.7 < np.mean(part) < 1.25
@@ -191,6 +207,56 @@ def test_the_highest_level_is_taken_and_others_on_demand(ur10):
     high, low = estimate_frf(data), estimate_frf(data, amplitude=0.25)
     assert high.amplitude == 1.0 and low.amplitude == 0.25
     assert np.median(low.total_std / high.total_std) == pytest.approx(4.0, rel=0.2)
+
+
+def test_points_of_other_periods_and_levels_share_their_frequencies(ur10):
+    """The second point has twice the period, the lines in between too, and was never measured at level 1."""
+    here, _ = recorded(ur10, 2, levels=(1.0, 0.5))
+    there, _ = recorded(ur10, 2, levels=(0.5,), longer=2, point="other")
+    finer = np.union1d(there.segments[0].excited_lines, [9, 11])
+    others = tuple(replace(s, name=f"other-{s.name}", excited_lines=finer) for s in there.segments)
+    data = replace(here, segments=here.segments + others)
+    frf = estimate_frf(data)
+    assert frf.operating_points == ("p", "other") and np.array_equal(frf.lines, GRID)
+    assert np.allclose(frf.frequency, GRID * RATE / SHORTEST)
+    for q in range(2):
+        assert np.sqrt(np.mean(np.abs((frf.G[q] - rigid(2)) / frf.total_std[q]) ** 2)) == pytest.approx(1.0, abs=0.3)
+    levels = estimate_distortion(data, frf)
+    assert levels.levels == (1.0, 0.5) and np.isnan(levels.excited[1, 0]).all()
+    assert levels.excited[1, 1] == pytest.approx(levels.excited[0, 1], rel=0.2)
+
+
+def test_points_without_a_common_frequency_are_refused(ur10):
+    data, _ = recorded(ur10, 2)
+    apart = tuple(replace(s, name=f"b{s.name}", operating_point="b", excited_lines=GRID + 1) for s in data.segments)
+    with pytest.raises(DataError, match=r"no frequency that all segments share.*ml"):
+        estimate_frf(replace(data, segments=data.segments + apart))
+
+
+@pytest.mark.parametrize("given", [None, np.zeros(2)])
+@pytest.mark.parametrize("noise", [1.0, 10.0])
+def test_a_single_period_is_judged_by_lines_that_nothing_excites(ur10, given, noise):
+    """Whatever the robot's file says of noise, where the dataset says nothing of it or that there is none."""
+    errors, claimed = [], []
+    for seed in range(20):
+        data, _ = recorded(ur10, 2, P=1, noise=noise, seed=seed)
+        frf = estimate_frf(replace(data, q_std=given, tau_std=given))
+        errors.append(np.abs(frf.G[0] - rigid(2)) ** 2)
+        claimed.append(frf.total_std[0] ** 2)
+    ratio = np.mean(errors, axis=0) / np.mean(claimed, axis=0)
+    for part in np.array_split(ratio, 3):
+        assert 0.7 < np.mean(part) < 1.3
+
+
+def test_a_single_period_of_lines_that_are_all_excited_is_judged_by_differences_of_its_samples(ur10):
+    quiet, loud = (recorded(ur10, 2, P=1, noise=x)[0] for x in (1.0, 10.0))
+
+    def spread(data):
+        every = tuple(replace(s, excited_lines=np.arange(GRID[0], GRID[-1] + 1)) for s in data.segments)
+        kept = replace(data, segments=every, q_std=None, tau_std=None)
+        return np.median(estimate_frf(kept).total_std[0, ::4])
+
+    assert spread(loud) > 2.0 * spread(quiet)
 
 
 @pytest.mark.parametrize(

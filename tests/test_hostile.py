@@ -358,7 +358,7 @@ def test_notes_beside_a_dataset_are_not_lost(folder):
 def bare_motion(robot, q, tau):
     t = np.arange(len(q)) / 250.0
     segment = Segment(name="m", kind="trajectory", role="identification", t=t, tau=tau, q=q)
-    return Dataset("poor", robot.name, robot, 250.0, robot.joint_names, "none", None, None, None, (segment,))
+    return Dataset("poor", robot, 250.0, robot.joint_names, "none", None, None, None, (segment,))
 
 
 @pytest.mark.parametrize("name", ["twomass", "ur10"])

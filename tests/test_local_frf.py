@@ -99,7 +99,7 @@ def recorded(
         )
     joints = tuple(robot.joint_names)
     std = noise * np.array([2e-3, 5.0])[:, None] * np.ones(n)
-    return Dataset("arm", robot.name, robot, RATE, joints, "zoh", std[0], std[1], None, tuple(segments))
+    return Dataset("arm", robot, RATE, joints, "zoh", std[0], std[1], None, tuple(segments))
 
 
 def relative_error(frf, n, damping=0.02):

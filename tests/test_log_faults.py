@@ -106,7 +106,6 @@ def motions(torque):
         )
     return Dataset(
         "moves",
-        "twomass",
         bench,
         RATE,
         bench.joint_names,

@@ -1,5 +1,6 @@
 """Maps of logs: what they misspell, or say of a quantity that it cannot be, is one clear line."""
 
+import re
 import shutil
 import tomllib
 
@@ -133,6 +134,36 @@ def test_an_arm_of_both_kinds_of_joints_has_units_of_both(tmp_path):
             convert_logs([log], tmp_path / "arm", mapped(tmp_path, wrong))
     geared = text.replace('"q2", unit = "m"', '"q2", unit = "rad", side = "motor"')
     convert_logs([log], tmp_path / "arm", mapped(tmp_path, geared))
+
+
+def two_joints(folder):
+    """(log, map without r and temperatures, text of an arm of two joints, geared 100) written to a folder."""
+    (folder / "mixed.urdf").write_text(MIXED)
+    write_robot(folder / "mixed.urdf", folder / "arm")
+    robot = (folder / "arm" / "robot.toml").read_text(encoding="utf-8")
+    (folder / "arm" / "robot.toml").write_text(re.sub(r"gear_ratio = \S+", "gear_ratio = 100.0", robot))
+    log = written(folder, t=T, a=np.sin(3 * T), b=0.3 * np.cos(2 * T), c=9 * np.cos(3 * T), d=5 * np.sin(2 * T))
+    columns = "".join(f'{k} = "{v}"\n' for k, v in {"q_1": "a", "q_2": "b", "tau_1": "c", "tau_2": "d"}.items())
+    return log, f'sample_rate = {1 / (T[1] - T[0]):.6g}\n[time]\nsource = "t"\n[columns]\n{columns}'
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("rad", 0.01), ("deg", 0.01 * np.pi / 180), ("N m", 100.0)])
+def test_a_reference_of_the_motor_is_an_angle_or_a_torque_by_its_unit(tmp_path, unit, factor):
+    """Angles shrink on the way through the gear, torques grow. A joint without a reference has none, which is said."""
+    log, text = two_joints(tmp_path)
+    told = []
+    more = f'r_1 = {{ source = "a", unit = "{unit}", side = "motor" }}\n'
+    data = convert_logs([log], tmp_path / "arm", mapped(tmp_path, text + more), say=told.append)
+    r = data.segments[0].r
+    assert r[:, 0] == pytest.approx(factor * np.sin(3 * T), abs=1e-9) and not r[:, 1].any()
+    assert any("r_2 taken as zero" in line for line in told)
+
+
+@pytest.mark.parametrize("channel", ["qd", "q_ref", "temp"])
+def test_a_channel_of_some_joints_is_not_filled_up(tmp_path, channel):
+    log, text = two_joints(tmp_path)
+    with pytest.raises(DataError, match=f"{channel}_2: .*no such column.*{channel}_1 to {channel}_2"):
+        convert_logs([log], tmp_path / "arm", mapped(tmp_path, text + f'{channel}_1 = "a"\n'))
 
 
 def test_a_byte_order_mark_before_a_file_is_no_fault(tmp_path):

@@ -30,7 +30,7 @@ def motion(robot, seed, tau_noise=0.02, hold="none"):
     tau = tau_noise * rng.normal(size=q.shape)
     segment = Segment(name=f"m{seed}", role="identification", kind="trajectory", t=t, tau=tau, q=q)
     return Dataset(
-        name="motion", robot_ref=robot.name, robot=robot, sample_rate=RATE, joints=robot.joint_names, input_hold=hold,
+        name="motion", robot=robot, sample_rate=RATE, joints=robot.joint_names, input_hold=hold,
         q_std=np.full(robot.n, 1e-6), tau_std=np.full(robot.n, 0.02), controller=None, segments=(segment,),
     )  # fmt: skip
 

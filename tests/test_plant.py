@@ -1,5 +1,7 @@
 """The plant against closed forms and against its own description."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -68,22 +70,25 @@ def test_rest_sags_by_torque_over_stiffness(ur10):
 @pytest.mark.parametrize(
     "hidden",
     [
-        None,
-        "hardening_stiffness:cubic=2e9",
-        "softening_stiffness:low_stiffness=8e3,transition=5e-4",
-        "backlash:gap=1e-3",
+        (),
+        ("hardening_stiffness:cubic=2e9",),
+        ("softening_stiffness:low_stiffness=8e3,transition=5e-4",),
+        ("backlash:gap=1e-3",),
+        ("joint_coupling:ratio=0.2", "softening_stiffness:low_stiffness=8e3,transition=5e-4", "backlash:gap=1e-3"),
     ],
 )
 def test_friction_by_load_sees_all_that_the_gear_carries(ur10, hidden):
     """The torque of the gear that friction by load grows with is the one that the simulator puts on the link, whatever
     law it has."""
-    place = "elbow_joint"
-    effects = [] if hidden is None else [parse_effect(f"{hidden.split(':')[0]}@{place}:{hidden.split(':')[1]}", ur10)]
+    place, before = "elbow_joint", "shoulder_lift_joint"
+    places = [(text.split(":"), before if "coupling" in text else place) for text in hidden]
+    effects = [parse_effect(f"{name}@{where}:{values}", ur10) for (name, values), where in places]
     plant = build_plant(ur10, effects)
     j, data = ur10.joint_names.index(place), mujoco.MjData(plant.model)
     load = carried(run_of(plant), place)
     for wind_up, rate in ((2e-4, 0.0), (-3e-3, 0.2), (4e-3, -0.1)):
         data.qpos[plant.motor[j]], data.qvel[plant.motor[j]] = wind_up, rate
+        data.qpos[plant.motor[j - 1]], data.qvel[plant.motor[j - 1]] = -0.5 * wind_up, 0.3 * rate
         mujoco.mj_forward(plant.model, data)
         on_link = data.qfrc_spring[plant.link[j]] + data.qfrc_damper[plant.link[j]]
         q, v, q_link, v_link = (
@@ -92,6 +97,27 @@ def test_friction_by_load_sees_all_that_the_gear_carries(ur10, hidden):
         )
         state = State(np.zeros(1), q, v, q_link, v_link, q, v, q_link)
         assert load(state) == pytest.approx([on_link], rel=1e-9, abs=1e-9)
+
+
+def test_laws_of_one_gear_and_springs_of_one_link_add_up(ur10):
+    """In any order: play, a soft middle beyond it, and a cubic term; two springs of which one rests elsewhere."""
+    place, gap, low, edge, cubic = "elbow_joint", 1e-3, 8e3, 5e-4, 2e9
+    effects = [
+        make_effect("softening_stiffness", place, low_stiffness=low, transition=edge),
+        make_effect("backlash", place, gap=gap),
+        make_effect("hardening_stiffness", place, cubic=cubic),
+        make_effect("gravity_spring", place, stiffness=100.0, rest_angle=0.8),
+        make_effect("dress_pack", place, stiffness=50.0, friction=1.0),
+    ]
+    for some in (effects, effects[::-1]):
+        plant = build_plant(ur10, some)
+        j, data = ur10.joint_names.index(place), mujoco.MjData(plant.model)
+        data.qpos[plant.motor[j]], data.qpos[plant.link[j]] = 4e-3 - 0.3, -0.3
+        mujoco.mj_forward(plant.model, data)
+        over = 4e-3 - gap / 2
+        gear = low * over + cubic * over**3 + (plant.drives["stiffness"][j] - low) * (over - edge)
+        assert data.qfrc_spring[plant.motor[j]] == pytest.approx(-gear, rel=1e-9)
+        assert data.qfrc_spring[plant.link[j]] == pytest.approx(gear + 100.0 * 1.1 + 50.0 * 0.3, rel=1e-9)
 
 
 def test_an_error_of_the_transmission_goes_through_the_law_of_the_gear(ur10):
@@ -230,6 +256,13 @@ def test_an_effect_is_read_from_text(ur10):
         ("cogging@elbow_joint:size=1", "size"),
         ("cogging@elbow_joint:amplitude=big", "big"),
         ("cogging@elbow_joint:amplitude=1e16", "at most 1e"),
+        ("sensor_delay@elbow_joint:delay=1e-3,channel=tau", "tau"),
+        ("base_elasticity@base:stiffness=1e5,damping=1e2,axis=0 0 0", "a direction"),
+        ("payload@flange:mass=2,com=0 0 0.1,com_x=0.1", "one of the two"),
+        ("coulomb_friction@elbow_joint:torque=3,asymmetry=5", "from -1 to 1"),
+        ("friction_drift@elbow_joint:relative_change=-3,time_constant=9", "from -1 to"),
+        ("torque_constant@elbow_joint:scale=0", "scale"),
+        ("stribeck_friction@elbow_joint:coulomb=3,static=2,stribeck_velocity=0.1", "at least coulomb"),
         ("torque_delay@elbow_joint", None),
         ("nonsense", "nonsense"),
     ],
@@ -240,6 +273,19 @@ def test_a_wrong_effect_is_one_clear_error(ur10, text, found):
         return
     with pytest.raises(DataError, match=found):
         parse_effect(text, ur10)
+
+
+def test_a_centre_of_mass_is_read_as_three_numbers_or_in_parts(ur10):
+    for name, place in (("payload", "flange"), ("link_inertia", "forearm_link")):
+        one = parse_effect(f"{name}@{place}:mass=2,com=0 0.02 0.1", ur10)
+        assert one == parse_effect(f"{name}@{place}:mass=2,com_y=0.02,com_z=0.1", ur10)
+
+
+def test_a_gear_is_softer_around_zero_and_is_so_once(ur10):
+    soft = make_effect("softening_stiffness", "elbow_joint", low_stiffness=8e3, transition=5e-4)
+    for effects, found in (([soft, soft], "twice"), ([replace(soft, low_stiffness=1e6)], "low_stiffness 1e\\+06")):
+        with pytest.raises(DataError, match=found):
+            build_plant(ur10, effects)
 
 
 @pytest.mark.parametrize("name", ["ur10", "irb", "panda"])

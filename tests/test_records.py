@@ -54,7 +54,7 @@ def test_noise_of_a_motion_costs_as_much_as_it_counts(seconds):
     q = 0.3 * (1 - np.cos(2 * np.pi * t / seconds))[:, None]
     motion = Segment(name="m", role="identification", kind="trajectory", t=t, tau=0.0 * q, q=q)
     data = Dataset(
-        name="noise", robot_ref="twomass", robot=bench, sample_rate=RATE, joints=bench.joint_names, input_hold="none",
+        name="noise", robot=bench, sample_rate=RATE, joints=bench.joint_names, input_hold="none",
         q_std=np.array([1e-12]), tau_std=np.array([0.05]), controller=None, segments=(motion,),
     )  # fmt: skip
     problem = set_up(data).problem
@@ -101,7 +101,7 @@ def moves_with_dwells(size, scale=1.0, asymmetry=0.0):
         for name, role, part in (("a", "identification", slice(None, cut)), ("b", "validation", slice(cut, None)))
     ]  # fmt: skip
     return Dataset(
-        name="moves", robot_ref="twomass", robot=bench, sample_rate=fs, joints=bench.joint_names, input_hold="none",
+        name="moves", robot=bench, sample_rate=fs, joints=bench.joint_names, input_hold="none",
         q_std=np.array([1e-7]), tau_std=np.array([0.02]), controller=None, segments=tuple(motions),
     )  # fmt: skip
 
@@ -190,9 +190,7 @@ def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     segment = Segment(
         "m", "trajectory", "identification", t, tau[:, None] + 1e-3 * rng.normal(size=(t.size, 1)), q[:, None]
     )
-    data = Dataset(
-        "cut", "twomass", bench, fs, bench.joint_names, "zoh", np.array([1e-6]), np.array([1e-3]), None, (segment,)
-    )
+    data = Dataset("cut", bench, fs, bench.joint_names, "zoh", np.array([1e-6]), np.array([1e-3]), None, (segment,))
     setup = set_up(data)
     (group,) = setup.problem.groups
     motion = predict(Model(setup.problem.structure, setup.problem.nominal), group, setup.problem.sampling).motion(group)
@@ -220,7 +218,6 @@ def periodic_positions():
         )  # fmt: skip
     data = Dataset(
         "lines",
-        "twomass",
         bench,
         RATE,
         bench.joint_names,

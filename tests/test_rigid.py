@@ -59,7 +59,6 @@ def rigid_motion(robot, seed, seconds=20.0):
 def dataset_of(robot, *segments):
     return Dataset(
         name="motions",
-        robot_ref="ur10",
         robot=robot,
         sample_rate=RATE,
         joints=robot.joint_names,
@@ -364,7 +363,7 @@ def test_a_ripple_is_sought_along_what_was_recorded_and_in_the_compared_band():
             )
         )
     data = Dataset(
-        "sweep", "emps", robot, RATE, robot.joint_names, "zoh", np.array([1e-6]), np.array([0.5]), None, tuple(segments)
+        "sweep", robot, RATE, robot.joint_names, "zoh", np.array([1e-6]), np.array([0.5]), None, tuple(segments)
     )
     setup, result = identify(data)
     preds = predictions(setup.problem, result.model, result.remainders)

@@ -30,6 +30,7 @@ def _folder(tmp_path, ur10, old="", new=""):
         ("motor_inertia = 2.0\n", "", "no such key"),
         ("ur10_robot.urdf", "none.urdf", "none.urdf"),
         ('link = "wrist_3_link"', 'link = "hand"', "hand"),
+        ("damping = 30.0", "damping = 30.0\nspring_damping = 30.0", "damping beside it"),
         ("[urdf]", "[[[", "invalid TOML"),
     ],
 )
@@ -53,12 +54,18 @@ def test_what_a_robot_may_leave_out_is_of_its_urdf_or_guessed(tmp_path):
     (tmp_path / "robot.toml").write_text(
         'urdf = "arm.urdf"\n' + "".join(f'[[joint]]\nname = "j{i}"\n{drive}' for i in range(2))
     )
+    by_file = (tmp_path / "robot.toml").read_text()
     robot = load_robot(tmp_path)
     assert robot.array("torque_limit") == pytest.approx([40.0, 100.0])
     assert robot.array("velocity_limit") == pytest.approx([3.0, 1.0])
     assert robot.array("q_std") == pytest.approx([3e-6, 1e-6])
     assert robot.array("tau_std") == pytest.approx([4e-3, 1e-2])
     assert robot.payload_link == "l2"
+    other = by_file.replace("\ndamping", "\nq_noise_std = 2e-5\ntorque_max = 9.0\nspring_damping")
+    (tmp_path / "robot.toml").write_text('flange = "l1"\n' + other)
+    same = load_robot(tmp_path)
+    assert same.payload_link == "l1" and np.array_equal(same.array("damping"), robot.array("damping"))
+    assert np.all(same.array("q_std") == 2e-5) and np.all(same.array("torque_limit") == 9.0)
 
 
 def test_an_unknown_robot_lists_the_known_ones():

@@ -17,7 +17,7 @@ from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
 from ident.segment_file import LARGEST, SHORTEST
 from robot_assets.errors import DataError
-from robot_assets.robot import ASSETS, linear_joints, load_robot
+from robot_assets.robot import linear_joints, load_robot
 
 
 def convert_logs(
@@ -55,10 +55,8 @@ def convert_logs(
         segments += found
     if len({s.name for s in segments}) < len(segments):
         raise DataError("files", str(map_path), "two logs of one name", "distinct names")
-    own = (ASSETS / arm.name).resolve() == arm.folder
     return Dataset(
         name=name,
-        robot_ref=arm.name if own else str(arm.folder),
         robot=arm,
         sample_rate=log_map.sample_rate,
         joints=arm.joint_names,
@@ -149,6 +147,9 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
     if any(f.time is not None for f in m.files):
         data, clocks, start = on_one_clock(data, m, paths, say)
     channels = _channels(data, m, n, path)
+    without = sorted(set(range(n)) - {c.joint for c in m.columns if c.channel == "r"})
+    if "r" in channels and without:
+        say(f"{path.name}: {', '.join(f'r_{j + 1}' for j in without)} taken as zero: the map does not have it")
     N = len(channels["q"])
     t = np.arange(N) / m.sample_rate
     if m.time is not None:

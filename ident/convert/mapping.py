@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ident.convert.quantities import KINDS, unit_factor, units_of
+from ident.convert.quantities import KINDS, is_position, unit_factor, units_of
 from robot_assets.errors import DataError
 from robot_assets.values import choice, exists, number, read_toml, show, subtable, tables, text, whole
 
@@ -148,7 +148,9 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
         raise DataError("[columns]", where, show(entries), 'a table such as q_1 = { source = "angle", unit = "deg" }')
     columns = tuple(_column(k, v, ratios, linear, where) for k, v in entries.items())
     have = {(c.channel, c.joint) for c in columns}
-    for channel in ("tau", "q"):
+    # Link encoders may be at some joints only, and what is not injected is no excitation.
+    whole_ones = {"tau", "q", *(c.channel for c in columns)} - {"q_link", "r"}
+    for channel in sorted(whole_ones):
         for j in range(len(ratios)):
             if (channel, j) not in have:
                 raise DataError(
@@ -284,7 +286,8 @@ def _column(key: str, entry: Any, ratios: np.ndarray, linear: np.ndarray, where:
             f"unit, sign, scale, torque_constant and gear of at least {SMALLEST:g} in all",
         )
     # Torques grow by the gear ratio on the way to the link, angles shrink; a temperature has no side.
-    factor *= ratio if channel in ("tau", "r") else 1.0 if channel == "temp" else 1.0 / ratio
+    by_torque = channel == "tau" or (channel == "r" and not is_position(entry.get("unit")))
+    factor *= ratio if by_torque else 1.0 if channel == "temp" else 1.0 / ratio
     unwrap = entry.get("unwrap", False)
     if not isinstance(unwrap, bool):
         raise DataError(f"{key}.unwrap", where, show(unwrap), "true or false")

@@ -52,3 +52,8 @@ def unit_factor(unit: Any, allowed: list[str], key: str, where: str) -> float:
     if not isinstance(unit, str) or unit not in allowed:
         raise DataError(f"unit of {key}", where, show(unit), f"one of {allowed}")
     return UNITS[unit]
+
+
+def is_position(unit: Any) -> bool:
+    """Whether a unit is one of angles or lengths."""
+    return any(unit in KINDS[own["position"]] for own in (TURNING, LINEAR))

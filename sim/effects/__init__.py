@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -67,6 +68,10 @@ SIZES = (
     "cubic",
 )
 LEAST, LARGEST = 1e-12, 1e15  # sizes of parameters, SI
+# Friction that drives the motor, and a drive of no torque or of the wrong sign, are none.
+LIMITS = {"asymmetry": (-1.0, 1.0), "relative_change": (-1.0, LARGEST), "scale": (LEAST, LARGEST)}
+CHANNELS = ("q", "q_link")
+COM = ("com_x", "com_y", "com_z")  # the parts of ``com``: either is understood
 LONGEST = 1.0  # s of a delay
 EFFECTS = {c.name: c for c in _CLASSES}
 
@@ -76,16 +81,17 @@ def parameters_of(effect: object) -> dict[str, object]:
     return {f.name.rstrip("_"): getattr(effect, f.name) for f in dataclasses.fields(effect) if f.name != "place"}
 
 
-def make_effect(name: str, place: str, **values: object) -> object:
+def make_effect(name: str, place: str, **values: Any) -> object:
     """An effect from its catalogue name, place and parameters.
 
     Raises:
-        DataError: for a name, place or parameter that there is not.
+        DataError: for a name, place or parameter that there is not, or parameters that contradict each other.
     """
     if name not in EFFECTS:
         raise DataError("effect", name, "no such effect", f"one of {sorted(EFFECTS)}")
     cls = EFFECTS[name]
     fields = {f.name.rstrip("_"): f for f in dataclasses.fields(cls) if f.name != "place"}
+    values = _center_of_mass(values, fields, f"{name}@{place}")
     for key in values:
         if key not in fields:
             raise DataError(f"effect {name}", place, f"parameter {key}", f"one of {list(fields)}")
@@ -95,6 +101,9 @@ def make_effect(name: str, place: str, **values: object) -> object:
     missing = [k for k in required if k not in values]
     if missing:
         raise DataError(f"effect {name}", place, f"no {missing[0]}", f"{required}")
+    if name == "stribeck_friction" and values["static"] < values["coulomb"]:
+        found, least = f"static {values['static']:g}", f"at least coulomb {values['coulomb']:g}"
+        raise DataError(f"effect {name}", place, found, f"{least}: friction falls with speed")
     return cls(place=place, **{fields[k].name: v for k, v in values.items()})
 
 
@@ -113,7 +122,7 @@ def parse_effect(text: str, robot: Robot) -> object:
     places = valid_places(name, robot)
     if place not in places:
         raise DataError("place", text, place, f"one of {places}")
-    values: dict[str, object] = {}
+    values: dict[str, Any] = {}
     for item in filter(None, (rest or "").split(",")):
         key, _, value = (part.strip() for part in item.partition("="))
         if key in values:
@@ -122,6 +131,19 @@ def parse_effect(text: str, robot: Robot) -> object:
     if not values:
         return draw_effect(np.random.default_rng(0), robot, names=(name,), place=place)
     return make_effect(name, place, **values)
+
+
+def _center_of_mass(values: dict[str, Any], fields: dict, where: str) -> dict[str, Any]:
+    """Values with a centre of mass as the effect takes it, of three numbers or in parts."""
+    parts = [key for key in COM if key in values]
+    if "com" in values and parts:
+        raise DataError(f"parameter {parts[0]}", where, "com beside it", "one of the two")
+    if "com" in values and "com" not in fields:
+        return {k: v for k, v in values.items() if k != "com"} | dict(zip(COM, values["com"], strict=True))
+    if parts and "com" in fields:
+        com = tuple(values.get(key, 0.0) for key in COM)
+        return {k: v for k, v in values.items() if k not in COM} | {"com": com}
+    return values
 
 
 def valid_places(name: str, robot: Robot) -> list[str]:
@@ -150,6 +172,8 @@ def free_axes(robot: Robot, joint: str) -> np.ndarray:
 
 def _value(key: str, text: str, where: str) -> object:
     if key == "channel":
+        if text not in CHANNELS:
+            raise DataError(f"parameter {key}", where, repr(text), f"one of {CHANNELS}")
         return text
     count = 3 if key in VECTORS else 1
     try:
@@ -159,8 +183,10 @@ def _value(key: str, text: str, where: str) -> object:
     if len(numbers) != count or not all(abs(v) <= LARGEST for v in numbers):
         expected = "three numbers with spaces" if count == 3 else "a number"
         raise DataError(f"parameter {key}", where, repr(text), f"{expected}, of at most {LARGEST:g}")
-    low = LEAST if key in DIVISORS else 0.0 if key in SIZES else -LARGEST
-    high = LONGEST if key == "delay" else LARGEST
+    if key == "axis" and not any(numbers):
+        raise DataError(f"parameter {key}", where, repr(text), "a direction")
+    low, high = LIMITS.get(key, (LEAST if key in DIVISORS else 0.0 if key in SIZES else -LARGEST, LARGEST))
+    high = LONGEST if key == "delay" else high
     if count == 1 and not low <= numbers[0] <= high:
         raise DataError(f"parameter {key}", where, repr(text), f"a number from {low:g} to {high:g}")
     return numbers if count == 3 else numbers[0]

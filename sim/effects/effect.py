@@ -90,13 +90,26 @@ def carried(run: Run, place: str) -> Callable[..., np.ndarray]:
     ids = [names.index(f"{kind}:{place}") for kind in GEAR_SPRINGS if f"{kind}:{place}" in names]
     springs = [(model.tendon_stiffness[i], *model.tendon_stiffnesspoly[i], *model.tendon_lengthspring[i]) for i in ids]
     damping = sum(model.tendon_damping[i] for i in ids)
+    others = _turned_by(run, ids[0], j)
 
     def at(x: State, more: np.ndarray | float = 0.0, rate: np.ndarray | float = 0.0) -> np.ndarray:
-        delta = x.q[:, j] - x.q_link[:, j] + more
-        total = damping * (x.v[:, j] - x.v_link[:, j] + rate)
+        delta = x.q[:, j] - x.q_link[:, j] + x.q @ others + more
+        total = damping * (x.v[:, j] - x.v_link[:, j] + x.v @ others + rate)
         for stiffness, second, third, low, high in springs:
             over = delta - np.clip(delta, low, high)
             total = total + over * (stiffness + over * (second + over * third))
         return total
 
     return at
+
+
+def _turned_by(run: Run, tendon: int, joint: int) -> np.ndarray:
+    """(n,) by how much the other motors turn a joint: their part in the tendon of its gear."""
+    model, ratios = run.model, np.zeros(run.robot.n)
+    motors = [model.joint(f"motor:{name}").id for name in run.robot.joint_names]
+    first = model.tendon_adr[tendon]
+    for wrap in range(first, first + model.tendon_num[tendon]):
+        at = int(model.wrap_objid[wrap])
+        if at in motors and motors.index(at) != joint:
+            ratios[motors.index(at)] += model.wrap_prm[wrap]
+    return ratios

@@ -24,7 +24,7 @@ class Payload:
     name = "payload"
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
-        part = spec.body(f"body:{robot.payload_link}").add_body(name="payload")
+        part = spec.body(f"body:{robot.payload_link}").add_body()
         part.explicitinertial = True
         part.mass = self.mass
         part.ipos = [self.com_x, self.com_y, self.com_z]
@@ -62,7 +62,7 @@ class TransverseElasticity:
     name = "transverse_elasticity"
 
     def hinges(self) -> tuple[Elasticity, ...]:
-        return (Elasticity(f"hidden:{self.place}", self.place, self.axis, self.stiffness, self.damping),)
+        return (_hidden(self.place, self.axis, self.stiffness, self.damping),)
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class BaseElasticity:
     name = "base_elasticity"
 
     def hinges(self) -> tuple[Elasticity, ...]:
-        return (Elasticity("hidden:base", "base", self.axis, self.stiffness, self.damping),)
+        return (_hidden("base", self.axis, self.stiffness, self.damping),)
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,7 @@ class GravitySpring:
     name = "gravity_spring"
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
-        joint = spec.joint(f"link:{self.place}")
-        joint.stiffness = [self.stiffness, 0, 0]
-        joint.springref = self.rest_angle
+        add_spring(spec.joint(f"link:{self.place}"), self.stiffness, self.rest_angle)
 
 
 @dataclass(frozen=True)
@@ -104,8 +102,21 @@ class DressPack:
     name = "dress_pack"
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
-        spec.joint(f"link:{self.place}").stiffness = [self.stiffness, 0, 0]
+        add_spring(spec.joint(f"link:{self.place}"), self.stiffness, 0.0)
 
     def dry(self, run: Run) -> Callable[[State], Dry]:
         dry = Dry(run.joint(self.place), self.friction, self.friction, link=True)
         return lambda x: dry
+
+
+def add_spring(joint: mujoco.MjsJoint, stiffness: float, rest_angle: float) -> None:
+    """One more spring on a joint: two in parallel are one that rests between them."""
+    there, both = float(joint.stiffness[0]), float(joint.stiffness[0]) + stiffness
+    if both > 0.0:
+        joint.springref = (there * float(joint.springref) + stiffness * rest_angle) / both
+    joint.stiffness = [both, *joint.stiffness[1:]]
+
+
+def _hidden(place: str, axis: tuple[float, float, float], stiffness: float, damping: float) -> Elasticity:
+    """A hinge that the model lacks: there may be several at a place, about different axes."""
+    return Elasticity(f"hidden:{place}:{' '.join(f'{x:g}' for x in axis)}", place, axis, stiffness, damping)

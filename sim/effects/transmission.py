@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from robot_assets.errors import DataError
 from robot_assets.robot import Robot
-from sim.effects.effect import Run, State, Torque, carried
+from sim.effects.effect import GEAR_SPRINGS, Run, State, Torque, carried
 
 
 @dataclass(frozen=True)
@@ -22,12 +23,12 @@ class HardeningStiffness:
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
         gear = spec.tendon(f"gear:{self.place}")
-        gear.stiffness = [gear.stiffness[0], gear.stiffness[1], self.cubic]
+        gear.stiffness = [gear.stiffness[0], gear.stiffness[1], gear.stiffness[2] + self.cubic]
 
 
 @dataclass(frozen=True)
 class SofteningStiffness:
-    """``low_stiffness`` within ``transition`` (rad) of zero: a second spring with a dead band."""
+    """``low_stiffness`` within ``transition`` (rad) of zero, or of the end of a dead band: a second spring with a wider one."""
 
     place: str
     low_stiffness: float
@@ -35,14 +36,20 @@ class SofteningStiffness:
     name = "softening_stiffness"
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
+        if spec.tendon(f"outer:{self.place}") is not None:
+            raise DataError(f"effect {self.name}", self.place, "it twice", "once at a joint")
         gear = spec.tendon(f"gear:{self.place}")
         high = float(gear.stiffness[0])
-        gear.stiffness = [self.low_stiffness, 0, 0]
+        if self.low_stiffness >= high:
+            found = f"low_stiffness {self.low_stiffness:g}"
+            raise DataError(f"effect {self.name}", self.place, found, f"less than the {high:g} of its gear")
+        gear.stiffness = [self.low_stiffness, *gear.stiffness[1:]]
+        play = float(gear.springlength[1])
         outer = spec.add_tendon(name=f"outer:{self.place}")
         outer.wrap_joint(f"motor:{self.place}", 1.0)
         outer.wrap_joint(f"link:{self.place}", -1.0)
         outer.stiffness = [high - self.low_stiffness, 0, 0]
-        outer.springlength = [-self.transition, self.transition]
+        outer.springlength = [-play - self.transition, play + self.transition]
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,9 @@ class Backlash:
     name = "backlash"
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
-        spec.tendon(f"gear:{self.place}").springlength = [-0.5 * self.gap, 0.5 * self.gap]
+        for tendon in springs_of(spec, self.place):
+            low, high = tendon.springlength
+            tendon.springlength = [low - 0.5 * self.gap, high + 0.5 * self.gap]
 
 
 @dataclass(frozen=True)
@@ -115,4 +124,11 @@ class JointCoupling:
 
     def edit(self, spec: mujoco.MjSpec, robot: Robot, drives: dict) -> None:
         target = robot.joint_names[robot.joint_names.index(self.place) + 1]
-        spec.tendon(f"gear:{target}").wrap_joint(f"motor:{self.place}", self.ratio)
+        for tendon in springs_of(spec, target):
+            tendon.wrap_joint(f"motor:{self.place}", self.ratio)
+
+
+def springs_of(spec: mujoco.MjSpec, joint: str) -> list[mujoco.MjsTendon]:
+    """Tendons that carry torque from the motor of a joint to its link."""
+    tendons = [spec.tendon(f"{spring}:{joint}") for spring in GEAR_SPRINGS]
+    return [t for t in tendons if t is not None]
