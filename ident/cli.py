@@ -116,6 +116,9 @@ def experiment(
             help="All operating points in one run, moves between them included; cut into the dataset.",
         ),
     ] = False,
+    link_encoders: Annotated[
+        bool, typer.Option("--link-encoders", help="Record link encoders; done anyway where an effect sits in one.")
+    ] = False,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -136,7 +139,7 @@ def experiment(
     if made.robot.folder != arm.folder:
         raise DataError("--plan", str(plan), f"a plan for {made.robot.name}", f"one for {arm.name}")
     _check_out(check_target(out))
-    run = {"seed": seed, "drives": figures, "name": out.name}
+    run = {"seed": seed, "drives": figures, "name": out.name, "link_encoders": link_encoders}
     summary, text = {"dataset": str(out)}, ""
     with _progress(quiet or json_) as (_, share):
         if one_recording:
@@ -230,6 +233,7 @@ def design(
 
     arm = _robot(robot)
     options = {"points": points, "candidates": candidates, "criterion": criterion, "draws": draws, "seed": seed}
+    _check_out(out.absolute().parent)
     with _progress(quiet or json_) as (say, _):
         summary, text = write_design(arm, out, tuple(level or (1.0,)), say, realizations=realizations, **options)
     _print(summary, json_, text)

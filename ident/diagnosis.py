@@ -388,22 +388,29 @@ def leave_one_out(
         renewed: whether the inertias of the links were found too.
     """
     problem = setup.problem
-    if len(problem.groups) < 2:
+    # Records of one posture may differ in their periods; each motion is one of its own.
+    of = [g.operating_point if g.window is None else i for i, g in enumerate(problem.groups)]
+    points = tuple(dict.fromkeys(of))
+    if len(points) < 2:
         return None
 
-    def without(i: int) -> Errors:
-        part = replace(problem, nominal=nominal, groups=tuple(g for k, g in enumerate(problem.groups) if k != i))
+    def without(point: str | int) -> Errors:
+        left_out, kept = (
+            tuple(g for g, name in zip(problem.groups, of, strict=True) if (name == point) is out)
+            for out in (True, False)
+        )
+        part = replace(problem, nominal=nominal, groups=kept)
         models = []
         for start in (baseline, result.final):
-            remainders = [W for k, W in enumerate(start.remainders) if k != i]
-            model, of = start.model, part
+            remainders = [W for W, name in zip(start.remainders, of, strict=True) if name != point]
+            model, data = start.model, part
             if renewed and start is result.final:
                 links = fit_rigid(build_structure(problem.structure.robot), nominal, part.groups)
-                model, of = replace(model, structure=links.structure), replace(part, nominal=links.par)
-            models.append(fit(of, model, iterations=4, remainders=remainders).model)
-        return segment_errors(problem, problem.groups[i : i + 1], *models, alone=False)[0]
+                model, data = replace(model, structure=links.structure), replace(part, nominal=links.par)
+            models.append(fit(data, model, iterations=4, remainders=remainders).model)
+        return segment_errors(problem, left_out, *models, alone=False)[0]
 
-    errors = workers.map(without, range(len(problem.groups)))
+    errors = workers.map(without, points)
     joined = Errors(
         tuple(n for e in errors for n in e.segments),
         *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")),

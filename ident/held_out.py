@@ -12,9 +12,11 @@ LEAST_HELD_OUT = 2.0  # s of it
 
 def with_held_out(dataset: Dataset) -> Dataset:
     """The dataset, its end held out where it is a single motion: nothing else would test what is named."""
-    if len(dataset.segments) != 1 or dataset.segments[0].kind != "trajectory":
+    if len(dataset.segments) != 1:
         return dataset
-    whole = dataset.segments[0]
+    (whole,) = dataset.segments
+    if whole.kind != "trajectory" or whole.role != "identification":
+        return dataset
     cut = round((1.0 - HELD_OUT_SHARE) * whole.n_samples)
     if (whole.n_samples - cut) / dataset.sample_rate < LEAST_HELD_OUT:
         return dataset

@@ -30,6 +30,8 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
     for group, pred, of_laws in zip(problem.groups, predictions, laws, strict=True):
         S = output_covariance(problem, group, pred, of_laws)
         k = np.arange(S.shape[1])
+        # Offsets that wander are slower than any line, and no scatter of neighbouring lines shows them: the static one is
+        # given twice the deviation of white noise.
         S[0] *= 4.0
         links = k[problem.structure.n :]
         if rho > 0 or len(links):

@@ -201,6 +201,16 @@ def test_an_output_that_cannot_be_is_refused_before_the_experiment_runs(tmp_path
         experiment("twomass", tmp_path / "file" / "d" if there == "below" else tmp_path / there, quiet=True)
 
 
+def test_a_plan_that_cannot_be_written_is_refused_before_it_is_made(tmp_path, monkeypatch):
+    from ident.cli import design
+    from robot_assets.errors import DataError
+
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("ident.design_output.design_experiment", lambda *args, **rest: pytest.fail("made for nothing"))
+    with pytest.raises(DataError, match=r"found .*file, which is a file|found a file"):
+        design("twomass", tmp_path / "file" / "plan.toml", quiet=True)
+
+
 def test_no_command_is_one_line_beside_the_help():
     run = simgap()
     assert run.returncode == 2 and "no command" in run.stderr and "experiment" in run.stdout

@@ -1,6 +1,7 @@
 """Identification of drives that are off by up to a factor of two, from files."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ from ident.chain import build_structure
 from ident.coordinates import pack, unpack
 from ident.costs import joint_costs
 from ident.derivatives import jacobian
-from ident.diagnosis import diagnose
+from ident.diagnosis import diagnose, leave_one_out
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.extended import predict
 from ident.frf import estimate_frf
 from ident.gain import segment_errors
 from ident.graybox import Parameters, equilibrium, linearise, sampled_frf
+from ident.held_out import with_held_out
 from ident.hypotheses import catalogue
 from ident.identification import identify, set_up
 from ident.model import Effect, Model
@@ -325,3 +327,21 @@ def test_a_common_offset_in_time_is_a_delay_where_there_is_one_joint(clean):
     assert data.input_hold == clean[0].input_hold == "zoh"
     assert not set_up(data).problem.free_timing
     assert set_up(replace(data, input_hold="none")).problem.free_timing and set_up(clean[0]).problem.free_timing
+
+
+def test_what_is_left_out_is_a_posture_with_all_its_records(identified):
+    """Records of one posture may differ in their periods, and are groups of their own."""
+    setup, baseline = identified
+    problem, found = setup.problem, SimpleNamespace(final=baseline)
+    gain = leave_one_out(setup, problem.nominal, baseline, found, False, ())
+    assert gain.segments == tuple(name for g in problem.groups for name in g.segments)
+    one = replace(problem, groups=tuple(replace(g, operating_point="op01") for g in problem.groups))
+    assert len(one.groups) > 1
+    assert leave_one_out(replace(setup, problem=one), problem.nominal, baseline, found, False, ()) is None
+
+
+def test_the_end_of_a_motion_is_held_out_where_it_is_the_only_one_to_fit(clean):
+    motion = next(s for s in clean[0].segments if s.kind == "trajectory")
+    for role, names in (("identification", ["motion", "motion-end"]), ("validation", ["motion"])):
+        alone = replace(clean[0], segments=(replace(motion, name="motion", role=role),))
+        assert [s.name for s in with_held_out(alone).segments] == names

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import diagnose
+from ident.plan import make_plan
+from robot_assets.robot import load_robot
 from sim.effects import make_effect
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -33,3 +35,12 @@ def test_link_encoders_on_time_are_not_named(ur10, tmp_path):
         small_plan(ur10, 13, levels=(1.0,), period=1000), [], seed=13, drives=drives, link_encoders=True
     )
     assert not diagnose(through_files(data, tmp_path)).causes
+
+
+@pytest.mark.parametrize(("channel", "recorded"), [("q_link", True), ("q", False)])
+def test_a_late_link_encoder_is_recorded_unasked(channel, recorded):
+    robot = load_robot("twomass")
+    hidden = make_effect("sensor_delay", robot.joint_names[0], delay=5e-3, channel=channel)
+    plan = make_plan(robot, points=1, validation_points=0, levels=(1.0,), period=200, trajectory=False)
+    (segment, *_) = quick_experiment(plan, [hidden]).segments
+    assert (segment.q_link is not None) == recorded
