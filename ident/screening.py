@@ -230,7 +230,8 @@ def _score(stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, sh
     for g, (group, pred) in enumerate(zip(stage.problem.groups, stage.predictions, strict=True)):
         if h.channel == "model":
             units = h.options["responses"](pred.structure, pred.par, pred.plane, group, pred.solution, shape)
-            sums = _whole_sums(stage, g, np.stack(units, axis=-1))
+            wound = h.options["winds"](pred.plane, pred.solution) if "winds" in h.options else None
+            sums = _whole_sums(stage, g, np.stack(units, axis=-1), wound)
         else:
             motion = stage.motions[g]
             made = h.screen(motion, h.joint, pred.par.stiffness[h.joint], shape)
@@ -283,9 +284,17 @@ def _lines(motion: Motion, signals: Sequence[np.ndarray]) -> np.ndarray:
     return np.stack([x if np.iscomplexobj(x) else motion.lines(x) for x in signals], axis=-1)
 
 
-def _whole_sums(stage: _Stage, g: int, units: np.ndarray) -> _Sums:
-    """Sums of output spectra (S, L, n + M, m)."""
-    X = stage.fit.weights.apply(g, stage.problem.groups[g].observe_outputs(units)).reshape(-1, units.shape[-1])
+def _whole_sums(stage: _Stage, g: int, units: np.ndarray, wound: np.ndarray | None = None) -> _Sums:
+    """Sums of output spectra (S, L, n + M, m).
+
+    Args:
+        wound: (S, joints, m) constant torques in the gears that go with them and move the arm to another posture.
+    """
+    X = stage.fit.weights.apply(g, stage.problem.groups[g].observe_outputs(units))
+    moved = stage.moved[g]
+    if wound is not None and moved is not None:
+        X = X + np.einsum("skoj,sjm->skom", moved, wound)
+    X = X.reshape(-1, units.shape[-1])
     J, r = stage.columns[g].reshape(-1, len(stage.moment)), stage.residuals[g].ravel()
     return _Sums((X.conj().T @ X).real, (X.conj().T @ r).real, (J.conj().T @ X).real)
 

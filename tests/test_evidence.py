@@ -386,6 +386,40 @@ def test_a_unit_response_holds_what_the_arm_does_where_it_comes_to_stand(identif
         assert whole < 0.1 * held
 
 
+def test_a_coupling_winds_the_gear_up_by_all_that_its_motor_has_turned(identified, monkeypatch):
+    """The joint that is turned too stands elsewhere, and there the arm is another."""
+    _, setup, result = identified
+    problem, value = setup.problem, 1e-4
+    (h,) = (
+        x for x in catalogue(problem.structure) if x.options.get("joints") == ("shoulder_lift_joint", "elbow_joint")
+    )
+    preds = predictions(problem, result.model, result.remainders, steps=8)
+    effects = (Effect(h, np.array([value])),)
+    moved = predictions(problem, replace(result.model, effects=effects), result.remainders, steps=8)
+    for group, a, b in zip(problem.groups, preds, moved, strict=True):
+        (unit,) = h.options["responses"](a.structure, a.par, a.plane, group, a.solution, ())
+        way = np.einsum("skoj,sjm->sko", moved_by_gears(a), h.options["winds"](a.plane, a.solution))
+        held, whole = (
+            np.linalg.norm((value * x - b.outputs(group) + a.outputs(group))[:, 1 : group.n_compared])
+            for x in (unit, unit + way)
+        )
+        assert whole < 0.2 * held
+
+
+def test_a_coupling_of_any_size_costs_what_it_is_known_by(identified):
+    """As other effects that are one number do; not its share of all ratios that there may be."""
+    (h,) = (
+        x
+        for x in catalogue(identified[1].problem.structure)
+        if x.options.get("joints") == ("wrist_1_joint", "wrist_2_joint")
+    )
+    for size in (1e-3, 0.1):
+        known = 3.0 / size**2 * 1e4  # to a hundredth
+        assert occam(candidate(h, [size], [known]), TEMPER) == pytest.approx(
+            -np.log(100.0 * np.sqrt(3.0 / TEMPER)), abs=0.01
+        )
+
+
 @pytest.mark.parametrize("j", [1, 2, 3])
 def test_a_softer_gear_lets_the_arm_sag_in_the_columns_of_the_drives(identified, j):
     """What a hypothesis explains is what the drives cannot: they move the arm to another posture too."""

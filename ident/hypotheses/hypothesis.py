@@ -135,6 +135,8 @@ class Hypothesis:
             ``nats(p)``: log odds before the data, where there is a reason for any. ``of_size(p)``: factor of the spreads
             that are expected of its parameters. ``body``: the link whose inertia it
             changes.
+            ``winds(plane, solution)``: (S, joints, m) constant torques in the gears, per unit of its parameters, by which
+            one of the chain moves the arm to another posture.
             ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a
             spring.
             ``filter(p, s)``: recorded torque per delivered one, or true position per measured one, of one that is

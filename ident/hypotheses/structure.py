@@ -153,12 +153,19 @@ def joint_coupling(source: int, target: int, place: str, turned: str) -> Hypothe
             + plane.output_per_motor[:, :, source] * borne[..., None]
         ]
 
+    ratio = Parameter("ratio", "1", -2.0, 2.0, step=1e-4)
+
+    def winds(plane, solution):
+        torque = np.zeros((*solution.Q[:, 0].shape, 1))
+        torque[:, target, 0] = (plane.C[0, target] * solution.Q[:, 0, source]).real
+        return torque
+
     return Hypothesis(
         "joint_coupling",
         place,
         source,
         "model",
-        (Parameter("ratio", "1", -2.0, 2.0, step=1e-4),),
+        (ratio,),
         None,
         lambda scale: [()],
         None,
@@ -167,6 +174,9 @@ def joint_coupling(source: int, target: int, place: str, turned: str) -> Hypothe
         options={
             "joints": (place, turned),
             "change": lambda p: Change(coupling=((target, source, float(p[0])),)),
+            "winds": winds,
+            # It may be of any size, as those effects are that have one alone.
+            "of_size": lambda p: min(abs(float(p[0])) / ratio.expected_spread(0.0), 1.0),
             "responses": responses,
             "start": lambda c: np.array([np.clip(c[0], -1.5, 1.5)]),
             "nats": lambda p: 0.0 if target == source + 1 else -DISTANT_NATS,
