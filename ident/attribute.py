@@ -99,7 +99,8 @@ def attribute(
         workers: where candidates are fitted.
     """
     if hypotheses is None:
-        hypotheses = catalogue(problem.structure, motions_alone=problem.motions_alone)
+        held = problem.sampling.hold == "zoh"
+        hypotheses = catalogue(problem.structure, motions_alone=problem.motions_alone, held=held)
     every = hypotheses = tuple(hypotheses)
     p_value = p_detected = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
@@ -137,7 +138,8 @@ def attribute(
         best = found.candidates[0]
         rounds.append(found)
         count += 1
-        unknown = unknown or (best.hypothesis.decoy and left_share(baseline, current) > LEFT_TO_DECOYS)
+        nameless = best.hypothesis.decoy and not best.hypothesis.options.get("of_record")
+        unknown = unknown or (nameless and left_share(baseline, current) > LEFT_TO_DECOYS)
         if best.hypothesis.decoy and not best.hypothesis.options.get("baseline"):
             break
         current = from_other_motions(problem, polish(problem, best.fit), workers)

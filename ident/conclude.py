@@ -37,7 +37,7 @@ from ident.trust import (
     within_steps,
 )
 from ident.units import linear_names, parameter_unit, text_at, unit_at
-from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
+from ident.verdict import LEFT_OUT, UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 AXIS_STEP = 1e-6  # of a tilt
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
@@ -84,7 +84,8 @@ def conclude(
     """
     final = result.final
     left = result.left_share if result.detected else 0.0
-    refuted = result.unknown or fails_held_out(gain, final, left)
+    halved = gain is not None and gain.method == LEFT_OUT and len({g.operating_point for g in problem.groups}) < 3
+    refuted = result.unknown or fails_held_out(gain, final, left, halved)
     unknown = result.detected and (
         refuted
         or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)

@@ -41,7 +41,7 @@ from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, fit
 from ident.trust import LEFT_ERROR, denied, known_probability
 from ident.units import torque_unit, units_of_torques
-from ident.verdict import UNKNOWN, Diagnosis, Gain, Verdict
+from ident.verdict import LEFT_OUT, UNKNOWN, Diagnosis, Gain, Verdict
 
 # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
 LEFT_BY_BOTH = 0.1
@@ -443,6 +443,6 @@ def leave_one_out(
         joined(workers.map(without, points)),
         units_of_torques(problem.structure.robot),
         affected,
-        "leave-one-operating-point-out",
+        LEFT_OUT,
         np.random.default_rng(SEED),
     )

@@ -17,7 +17,7 @@ from ident.derivatives import jacobians, normal_equations
 from ident.problem import Problem, predictions
 from ident.torque_fit import RIDGE, Fit, inverse
 
-LEAST_JOINTS = 3  # two may differ by an effect at either
+LEAST_JOINTS = 2  # that must tell it, and agree: of one it may as well be a lag of its drive
 SURE = 5.0  # standard deviations from nothing
 ALIKE = 4.0  # the same of a joint from what all share
 SLACK = 0.25  # of the roll-off, by which a joint may differ beside that: its model is not exact
@@ -76,5 +76,5 @@ def agreed(values: np.ndarray, std: np.ndarray, limit: float) -> float:
     middle = float(values[order][np.searchsorted(weight, 0.5 * weight[-1])])
     near = np.abs(values - middle) < ALIKE * std + SLACK * abs(middle)
     told = near & (std < abs(middle) / SURE)
-    most = 2 * np.sum(near) > len(values) and np.sum(told) >= LEAST_JOINTS - 1
+    most = 2 * np.sum(near) > len(values) and np.sum(told) >= LEAST_JOINTS
     return middle if most and abs(middle) < limit else 0.0

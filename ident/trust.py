@@ -79,7 +79,7 @@ def explained_share(found: Round, final: Fit) -> float:
     return fall / max(fall + left, 1e-300)
 
 
-def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
+def fails_held_out(gain: Gain | None, final: Fit, left: float, halved: bool = False) -> bool:
     """Whether held-out data refute the extended model: no name is trusted then.
 
     It predicts them worse than the baseline, or leaves most of a clear error that the causes were named for;
@@ -87,6 +87,8 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
 
     Args:
         left: share of the discrepancy, as power, that the model leaves of the data that it was fitted to.
+        halved: whether a posture is left out of two: a model that is right is then fitted to half of what it was, and
+            need not carry over as well.
     """
     if gain is None:
         return False
@@ -94,6 +96,8 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float) -> bool:
         return True
     if gain.gap_closed is None or not gain.before > CLEAR * gain.noise_floor:
         return False
+    if halved:
+        return gain.gap_closed < CLOSED
     lost = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
     expected = 1.0 - np.sqrt(left)
     return gain.gap_closed < max(CARRIED if lost else CLOSED, expected - SHORT)

@@ -27,6 +27,7 @@ KIND_UNITS = {
     "viscous_friction": "N m s/rad",
     "torque_offset": "N m",
     "link_friction": "N m s/rad",
+    "record_roll_off": "s2",
 }
 """Units of the parameters of rotary joints by kind."""
 

@@ -17,6 +17,7 @@ from robot_assets.robot import Robot
 
 SCHEMA = "simgap-verdict/1"
 UNKNOWN = "unknown cause remains"
+LEFT_OUT = "leave-one-operating-point-out"
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, 
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
 from ident.trust import shadowed, shown
-from ident.verdict import UNKNOWN, Cause, Gain, Value
+from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -621,6 +621,15 @@ def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise,
     closed = (before - after) / (before - noise)
     gain = Gain(("a",), "RMS", before, after, noise, closed, (closed, closed), "validation segments")
     assert fails_held_out(gain, SimpleNamespace(chi2_per_dof=chi2), left) == refuted
+
+
+@pytest.mark.parametrize(("after", "refuted"), [(3.3, False), (4.5, False), (6.5, True), (11.0, True)])
+def test_a_posture_left_out_of_two_refutes_what_closes_less_than_half(after, refuted):
+    """Of a model that is fitted to half of the data."""
+    from ident.trust import fails_held_out
+
+    gain = Gain(("a",), "RMS", 10.0, after, 1.0, (10.0 - after) / 9.0, None, LEFT_OUT)
+    assert fails_held_out(gain, SimpleNamespace(chi2_per_dof=1.0), 0.0, halved=True) == refuted
 
 
 def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():

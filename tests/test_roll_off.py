@@ -7,7 +7,10 @@ import pytest
 
 from ident.diagnosis import diagnose
 from ident.identification import identify
+from ident.plan import make_plan
 from ident.roll_off import agreed
+from robot_assets.robot import load_robot
+from sim.effects import make_effect
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
 
@@ -41,13 +44,18 @@ def test_a_recorder_that_averages_samples_is_told_and_is_no_cause(averaged, tmp_
     assert sum("alike at all joints" in note for note in verdict.notes) == 1
 
 
+def mean_of_three(x):
+    """Of neighbouring samples of signals that repeat."""
+    return np.mean([np.roll(x, k, axis=0) for k in (-1, 0, 1)], axis=0)
+
+
 def test_what_one_joint_loses_is_not_the_recorders(averaged):
     """The mean of three samples at one joint of three: the others do not outvote it. A torque that is held from sample
     to sample is recorded as it is."""
 
     def part(s):
         tau = s.tau.copy()
-        tau[:, 1] = np.mean([np.roll(s.tau[:, 1], k) for k in (-1, 0, 1)], axis=0)
+        tau[:, 1] = mean_of_three(s.tau[:, 1])
         return replace(s, tau=tau)
 
     given = replace(averaged, segments=tuple(part(s) for s in averaged.segments))
@@ -70,3 +78,24 @@ def test_what_one_joint_loses_is_not_the_recorders(averaged):
 )
 def test_most_joints_must_agree(values, std, expected):
     assert agreed(np.array(values), np.array(std), 10.0) == pytest.approx(expected, rel=0.06)
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    """One linear axis with a spring on its link, its force averaged over three samples by the recorder."""
+    robot = load_robot("emps")
+    plan = make_plan(robot, points=2, validation_points=1, levels=(1.0,), period=2000, trajectory=False, seed=3)
+    hidden = make_effect("gravity_spring", robot.joint_names[0], stiffness=10.0, rest_angle=0.1)
+    data = quick_experiment(plan, [hidden], seed=3, noise=0.1)
+    segments = tuple(replace(s, tau=mean_of_three(s.tau)) for s in data.segments)
+    return through_files(replace(data, segments=segments, input_hold="none"), tmp_path_factory.mktemp("single"))
+
+
+def test_of_a_single_joint_it_is_found_among_the_causes_and_is_none(single):
+    verdict = diagnose(single)
+    assert [c.effect for c in verdict.causes if c.probability > 0.5] == ["gravity_spring"]
+    assert verdict.unexplained_verdict == "noise floor reached"
+    assert any("averages or holds samples" in note for note in verdict.notes)
+    joint = single.joints[0]
+    found = verdict.baseline[f"record_roll_off.{joint}"]
+    assert found.unit == "s2" and found.value == pytest.approx(1e-6 / 3.0, rel=0.15)  # to second order

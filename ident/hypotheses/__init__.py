@@ -33,7 +33,7 @@ PER_JOINT = (
 )
 
 
-def catalogue(chain: Structure, *, motions_alone: bool = False) -> tuple[Hypothesis, ...]:
+def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = True) -> tuple[Hypothesis, ...]:
     """Every hypothesis at every place of an arm, decoys included.
 
     Decoys describe what the catalogue lacks: one that explains the data better than every named
@@ -42,6 +42,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False) -> tuple[Hypothe
     Args:
         motions_alone: of records without multisines. Constant errors of the torque are part of the baseline there, and
             the bristles of a friction are not damped.
+        held: whether the recorded torque is known to be held from sample to sample; else its record may roll off.
     """
     robot = chain.robot
     names = robot.joint_names
@@ -64,6 +65,8 @@ def catalogue(chain: Structure, *, motions_alone: bool = False) -> tuple[Hypothe
         out += [drifts.torque_drift(j, name), drive.torque_ripple(j, name)]
         if not motions_alone:
             out.append(sensing.constant_torque(j, name))
+            if not held:
+                out.append(drive.record_roll_off(j, name))
         if robot.joints[j].gear_ratio != 1.0:
             out.append(sensing.encoder_eccentricity(j, name, robot.joints[j].gear_ratio))
     for j, k in itertools.permutations(range(len(names)), 2):

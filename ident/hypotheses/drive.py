@@ -13,6 +13,7 @@ from ident.motion import Motion
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
 SCALE = Parameter("scale", "1", 0.2, 5.0, log=True)  # delivered torque over the recorded one
 MOST_RIPPLE = 0.5  # of the torque of a motor, that ripples with it
+LEAST_KEPT = 0.1  # of a torque at any frequency, by its record
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
 
@@ -106,6 +107,38 @@ def torque_delay(joint: int, place: str) -> Hypothesis:
         "The torque of {joint} acts {delay:.3g} s after its record: phase linear in frequency, gain untouched.",
         variable="torque",
         options={"filter": late},
+    )
+
+
+def record_roll_off(joint: int, place: str) -> Hypothesis:
+    """Decoy: the record of the torque loses gain towards high frequencies and no phase, as one that averages samples;
+    or it gains some, as one that holds what the motor does not.
+
+    Beside an offset of its clock that nobody knows, a short lag of the drive looks as the latter does.
+    """
+
+    def loss(p, s: np.ndarray) -> np.ndarray:
+        return np.maximum(1.0 + p[0] * (s**2).real, LEAST_KEPT)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        return Screen(
+            (-(motion.group.omega**2) * motion.solution.U[..., j],),
+            np.array,
+        )
+
+    return Hypothesis(
+        "unknown:record_roll_off",
+        place,
+        joint,
+        "drive",
+        (Parameter("roll_off", "s2", -1e-2, 1e-2, step=1e-10),),
+        lambda p, motion, j, k, U: U * loss(p, 1j * motion.group.omega),
+        lambda scale: [()],
+        screen,
+        "The record of the torque of {joint} changes its gain by {roll_off:.3g} s2 times the square of the frequency, as a"
+        " recorder that averages or holds samples does; a short lag of the drive cannot be told from that here.",
+        variable="torque",
+        options={"filter": loss, "baseline": "record_roll_off", "of_record": True},
     )
 
 

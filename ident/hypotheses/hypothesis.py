@@ -143,6 +143,7 @@ class Hypothesis:
                 linear, (L,).
             ``nearer(p)``: the hypothesis of the same hinge sought from another axis, and its parameters, where its own
                 is nearer to that.
+            ``of_record``: of a decoy that lies in how the record was made, and so leaves no cause unknown.
             ``baseline``: of an effect that is no cause of the catalogue but part of the baseline, the name of its value
                 there.
     """
