@@ -31,6 +31,7 @@ from ident.trust import (
     fails_held_out,
     known_probability,
     left_of,
+    patchwork,
     shadowed,
     shown,
     too_fast,
@@ -85,7 +86,7 @@ def conclude(
     final = result.final
     left = result.left_share if result.detected else 0.0
     halved = gain is not None and gain.method == LEFT_OUT and len({g.operating_point for g in problem.groups}) < 3
-    refuted = result.unknown or fails_held_out(gain, final, left, halved)
+    refuted = result.unknown or fails_held_out(gain, final, left, halved) or patchwork(named_effects(final))
     unknown = result.detected and (
         refuted
         or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)

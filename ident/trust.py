@@ -42,6 +42,7 @@ HALF_TRUSTED = 0.1
 # of the fall of the cost that a faint cause foretells on held-out data, below which it does not come
 DENIED_SHARE = 0.25
 CHANCE = 3.0  # standard deviations of that fall, within which it may be short by chance
+PATCHES = 3  # bodies and hinges other than those described, from which no name is trusted
 LATE = "_delay", "_lag"  # effects by which a channel comes late
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
@@ -101,6 +102,16 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float, halved: bool = Fa
     lost = final.chi2_per_dof < LEFT_ERROR and gain.after > ABOVE_NOISE * gain.noise_floor
     expected = 1.0 - np.sqrt(left)
     return gain.gap_closed < max(CARRIED if lost else CLOSED, expected - SHORT)
+
+
+def patchwork(effects: Sequence[Effect]) -> bool:
+    """Whether a model was given so many other bodies and hinges that together they stand for something else.
+
+    Each of them shows at every joint, and a few describe most of what a chain of another kind does: an inertia between
+    motor and gear was two links and a hinge.
+    """
+    chain = [e.hypothesis for e in effects if not e.hypothesis.decoy]
+    return sum("body" in h.options or "hinge" in h.options for h in chain) >= PATCHES
 
 
 def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:

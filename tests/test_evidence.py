@@ -52,7 +52,7 @@ from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_
 from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, choose, explore, other_bodies
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
-from ident.trust import shadowed, shown
+from ident.trust import fails_held_out, patchwork, shadowed, shown
 from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
@@ -616,8 +616,6 @@ def test_frfs_of_a_right_model_lie_on_the_measured_ones(identified):
     ],
 )
 def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise, chi2, left, refuted):
-    from ident.trust import fails_held_out
-
     closed = (before - after) / (before - noise)
     gain = Gain(("a",), "RMS", before, after, noise, closed, (closed, closed), "validation segments")
     assert fails_held_out(gain, SimpleNamespace(chi2_per_dof=chi2), left) == refuted
@@ -626,8 +624,6 @@ def test_held_out_data_refute_names_that_do_not_carry_over(before, after, noise,
 @pytest.mark.parametrize(("after", "refuted"), [(3.3, False), (4.5, False), (6.5, True), (11.0, True)])
 def test_a_posture_left_out_of_two_refutes_what_closes_less_than_half(after, refuted):
     """Of a model that is fitted to half of the data."""
-    from ident.trust import fails_held_out
-
     gain = Gain(("a",), "RMS", 10.0, after, 1.0, (10.0 - after) / 9.0, None, LEFT_OUT)
     assert fails_held_out(gain, SimpleNamespace(chi2_per_dof=1.0), 0.0, halved=True) == refuted
 
@@ -1542,3 +1538,15 @@ def test_a_body_that_a_load_may_change_costs_no_more_where_it_changes_little(nam
         occam(candidate(link_inertia("wrist_3_link", 5, carries_load=c), large, sharp), TEMPER) for c in (True, False)
     )
     assert carrier == other
+
+
+def test_many_other_bodies_and_hinges_stand_for_something_else(named):
+    hinge = named["transverse_elasticity", "elbow_joint"]
+    bodies = [named["link_inertia", link] for link in ("forearm_link", "upper_arm_link")]
+    laws = [named["coulomb_friction", joint] for joint in ("elbow_joint", "wrist_1_joint", "wrist_2_joint")]
+
+    def effects(*hypotheses):
+        return [SimpleNamespace(hypothesis=h) for h in hypotheses]
+
+    assert patchwork(effects(hinge, *bodies))
+    assert not patchwork(effects(hinge, bodies[0], *laws)) and not patchwork([])
