@@ -37,7 +37,6 @@ class Group:
         window: (n_time,) weight of a motion in the time domain, or None for periodic data.
         amplitude: (S,) relative level.
         start: (S,) s, time of the first sample of the middle period, for drift over the recording.
-        temperature: (S, n) degC means, or None.
         period_time: s.
         periods: (S,) number of periods averaged.
         rest: (S, n_time, n) where motors stand still, or turn.
@@ -67,7 +66,6 @@ class Group:
     window: np.ndarray | None
     amplitude: np.ndarray
     start: np.ndarray
-    temperature: np.ndarray | None
     period_time: float
     periods: np.ndarray
     white_noise: np.ndarray
@@ -208,7 +206,6 @@ class Group:
             "excited",
             "amplitude",
             "start",
-            "temperature",
             "periods",
             "rest",
             "Q_fast",

@@ -113,7 +113,6 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
     for i, s in enumerate(members):
         lines = np.asarray(s.excited_lines, int)
         excited[i, lines[lines < n_lines]] = True
-    temps = [s.temp for s in members]
     n_time = scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True)
     white_noise = np.mean([difference_noise(s.q) ** 2 for s in members], axis=0) / N
     fast = np.stack([_lines(x, min(N // 2, (n_time + 1) // 2))[:, n_lines:] for x in q])
@@ -134,7 +133,6 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
         window=None,
         amplitude=np.array([s.amplitude for s in members]),
         start=np.array([began[s.name] for s in members]) + _middle_periods(members) * N / fs,
-        temperature=None if any(x is None for x in temps) else np.stack([x.mean(axis=0) for x in temps]),
         period_time=N / fs,
         periods=np.array([s.steady_periods for s in members]),
         white_noise=white_noise,
@@ -222,7 +220,6 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
         window=window,
         amplitude=np.ones(1),
         start=np.array([began[segment.name]]),
-        temperature=None if segment.temp is None else segment.temp.mean(axis=0)[None],
         period_time=N / fs,
         periods=np.ones(1, int),
         white_noise=difference_noise(segment.q) ** 2 / N,

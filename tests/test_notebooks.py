@@ -10,9 +10,10 @@ from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 NAMES = sorted(p.name for p in FOLDER.glob("*.ipynb"))
+LONG = ("the_seed_paper.ipynb",)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in NAMES])
 def test_notebook_runs(name):
     notebook = nbformat.read(FOLDER / name, as_version=4)
     assert any("assert" in c.source for c in notebook.cells if c.cell_type == "code")
