@@ -24,7 +24,7 @@ from ident.information import motor_loads
 from ident.model import simulated_laws
 from ident.parallel import map_threads
 from ident.plan import Plan, make_plan
-from ident.problem import Problem
+from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import Fit
 from ident.verdict import Cause
 from ident.weights import make_weights
@@ -159,15 +159,20 @@ def _peak(group: Group) -> np.ndarray:
 
 
 def _separation(problem: Problem, option: _Option, a: Fit, b: Fit) -> float:
-    """Expected evidence, nats, for ``a`` against ``b`` refitted, and the other way round; the smaller."""
-    group = option.group
-    a, b = (replace(x, model=simulated_laws(x.model)) for x in (a, b))  # there is no record of it yet
+    """Expected evidence, nats, for ``a`` against ``b`` refitted, and the other way round; the smaller. None at all where
+    one of them cannot be computed there."""
     try:
-        preds = [predict(x.model, group, problem.sampling) for x in (a, b)]
-        here = replace(problem, groups=(group,))
-        weighted = [make_weights(here, [x], 0.0) for x in preds]
-    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        nats = _expected(problem, option.group, *(replace(x, model=simulated_laws(x.model)) for x in (a, b)))
+    except NOT_COMPUTED:
         return 0.0
+    return nats if np.isfinite(nats) else 0.0
+
+
+def _expected(problem: Problem, group: Group, a: Fit, b: Fit) -> float:
+    """``_separation`` of models of which there is no record yet."""
+    preds = [predict(x.model, group, problem.sampling) for x in (a, b)]
+    here = replace(problem, groups=(group,))
+    weighted = [make_weights(here, [x], 0.0) for x in preds]
     falls = []
     for fit, own, other, weights in ((a, *preds, weighted[0]), (b, *preds[::-1], weighted[1])):
         change = group.observe(other.U - own.U)
@@ -177,7 +182,7 @@ def _separation(problem: Problem, option: _Option, a: Fit, b: Fit) -> float:
         step = np.linalg.pinv(known / np.outer(size, size), rcond=1e-12, hermitian=True) @ (moment / size)
         left = np.sum(np.abs(weights.apply(0, change)) ** 2) - (moment / size) @ step
         falls.append(0.5 * float(left))
-    return min(falls) if np.all(np.isfinite(falls)) else 0.0
+    return float(np.min(falls))
 
 
 def _plan(problem: Problem, option: _Option) -> Plan:

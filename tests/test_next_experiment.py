@@ -46,6 +46,13 @@ def test_a_model_is_not_separated_from_itself(fitted):
         assert _separation(problem, option(problem, 2.0), result, result) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_what_cannot_be_computed_separates_nothing(fitted):
+    problem, baseline, (_, hard), _ = fitted
+    for lost in (np.nan, np.inf):
+        unknown = replace(hard, information=lost * hard.information)
+        assert _separation(problem, option(problem, 2.0), baseline, unknown) == 0.0
+
+
 def test_what_the_drives_can_take_up_does_not_separate(fitted):
     """A stiffness that differs by 1 % is a parameter of both models: only where it is known already does it tell."""
     problem, baseline, _, _ = fitted
