@@ -80,8 +80,8 @@ def estimate_frf(
     powers = [sample_noise_power(dataset, period, frequency) for period in periods]
     unsaid = any(given_noise(dataset, channel) is None for channel in ("q", "tau"))
     scatters = [
-        _unexcited_scatter(members, lines[name], G, dataset) if unsaid else None
-        for (name, members), G in zip(points.items(), results, strict=True)
+        _unexcited_scatter(members, lines[name], G, dataset) if unsaid and b.U.shape[:2] == (1, 1) else None
+        for (name, members), b, G in zip(points.items(), blocks, results, strict=True)
     ]
     spreads = [_covariance(b, G, kind, *x) for b, G, *x in zip(blocks, results, powers, scatters, strict=True)]
     diag = [tuple(unvec(np.einsum("fii->fi", c).real, n) for c in pair) for pair in spreads]
