@@ -57,6 +57,8 @@ def load_dataset(path: str | Path) -> Dataset:
         raise DataError("[[segment]]", where, f"{len(entries)} entries", f"1 to {MAX_SEGMENTS}")
     seen: dict[str, str] = {}
     names: set[str] = set()
+    segments = tuple(_segment(e, i, folder, where, len(joints), rate, seen, names) for i, e in enumerate(entries))
+    _refuse_copies(segments, list(seen), where)
     return Dataset(
         name=str(head.get("name") or folder.resolve().name),
         robot=robot,
@@ -66,7 +68,7 @@ def load_dataset(path: str | Path) -> Dataset:
         q_std=levels["q_std"],
         tau_std=levels["tau_std"],
         controller=subtable(head, "controller", where) or None,
-        segments=tuple(_segment(e, i, folder, where, len(joints), rate, seen, names) for i, e in enumerate(entries)),
+        segments=segments,
         path=folder,
     )
 
@@ -240,6 +242,15 @@ def _segment(
         realization=whole(entry, "realization", where, low=1, default=None),
         excited_lines=_lines(entry.get("excited_lines", []), period, where),
     )
+
+
+def _refuse_copies(segments: tuple[Segment, ...], files: list[str], where: str) -> None:
+    """Raise a DataError where one segment stands there in two formats."""
+    known: dict[str, tuple[Segment, str]] = {}
+    for segment, file in zip(segments, files, strict=True):
+        first, other = known.setdefault(os.path.splitext(file)[0], (segment, file))
+        if first is not segment and all(np.array_equal(getattr(first, c), getattr(segment, c)) for c in ("tau", "q")):
+            raise DataError("file", where, f"{file} with the samples of {other}", "each segment once")
 
 
 def _name_of(file: Path, taken: set[str]) -> str:

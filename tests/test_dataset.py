@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import pyarrow.parquet as pq
 import pytest
 
@@ -207,7 +208,8 @@ def test_files_of_one_name_are_segments_of_their_own(folder):
     (path / "b").mkdir()
     shutil.copy(path / "b.parquet", path / "b" / "c.parquet")
     shutil.copy(path / "b.parquet", path / "b-c.parquet")
-    pa.csv.write_csv(pq.read_table(path / "b.parquet"), path / "b.csv")
+    table = pq.read_table(path / "b.parquet")
+    pa.csv.write_csv(table.set_column(1, "tau_1", pa.compute.add(table["tau_1"], 1.0)), path / "b.csv")
     more = "".join(
         f'[[segment]]\nfile = "{file}"\nkind = "trajectory"\n' for file in ("b.csv", "b/c.parquet", "b-c.parquet")
     )

@@ -72,7 +72,6 @@ def folder(tmp_path, ur10):
     )
     data = Dataset(
         "small",
-        "ur10",
         ur10,
         1000.0,
         ur10.joint_names,

@@ -97,7 +97,6 @@ def sticking(static=COULOMB, seed=0):
             )  # fmt: skip
     data = Dataset(
         "sticking",
-        "twomass",
         bench,
         FS,
         bench.joint_names,

@@ -43,7 +43,7 @@ def test_what_has_no_angle_in_it_is_the_same_at_both(unit):
 
 
 def test_no_parameter_of_a_drive_at_a_linear_joint_is_told_per_radian():
-    assert all("rad" not in LINEAR_UNITS[unit] for unit in KIND_UNITS.values())
+    assert all("rad" not in unit_at(unit, True) for unit in KIND_UNITS.values())
 
 
 def test_no_effect_of_a_linear_joint_is_told_in_radians():

@@ -55,7 +55,7 @@ def write_dataset(folder: Path) -> Path:
         segment("a", kind="multisine", amplitude=1.0, excited_lines=np.array([1, 3, 5]), **labels),
         segment("b", kind="trajectory"),
     )
-    save_dataset(Dataset("small", "twomass", robot, 1000.0, robot.joint_names, "zoh", None, None, None, made), folder)
+    save_dataset(Dataset("small", robot, 1000.0, robot.joint_names, "zoh", None, None, None, made), folder)
     return folder
 
 

@@ -168,7 +168,7 @@ TOML = {  # what is replaced in robot.toml, and by what
     "negative": (r"stiffness = \S+", "stiffness = -5.0"),
     "zero": (r"damping = \S+", "damping = 0.0"),
     "infinite": (r"torque_limit = \S+", "torque_limit = inf"),
-    "a key missing": (r"q_std = .*", ""),
+    "a key missing": (r"motor_inertia = .*", ""),
     "another joint": (r'name = "one"', 'name = "nine"'),
     "a joint twice": (r'name = "one"', 'name = "two"'),
     "a URDF outside": (r'file = "pair.urdf"', 'file = "/etc/passwd"'),
