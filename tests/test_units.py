@@ -8,7 +8,6 @@ from ident.hypotheses import catalogue
 from ident.model import Effect
 from ident.units import (
     KIND_UNITS,
-    LINEAR_UNITS,
     linear_names,
     parameter_unit,
     response_unit,
