@@ -106,11 +106,13 @@ def common_lines(points: dict[str, list[Segment]], dataset: Dataset) -> dict[str
     shared = None
     for members in points.values():
         first = members[0]
+        lines = np.asarray(first.excited_lines, int)
         for s in members:
             if s.period != first.period:
                 raise DataError("period", s.name, str(s.period), f"{first.period} as in {first.name}")
-            frequencies = {Fraction(int(k), int(first.period)) for k in s.excited_lines}
-            shared = frequencies if shared is None else shared & frequencies
+            lines = np.intersect1d(lines, s.excited_lines)
+        frequencies = {Fraction(int(k), int(first.period)) for k in lines}
+        shared = frequencies if shared is None else shared & frequencies
     if not shared:
         found, wanted = "no frequency that all segments share", "a common grid (`identify --estimator ml` needs none)"
         raise DataError("excited_lines", dataset.name, found, wanted)

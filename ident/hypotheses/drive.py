@@ -8,12 +8,12 @@ import numpy as np
 
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.ripple import SECOND, ripple
+from ident.inverse import recorded_share
 from ident.motion import Motion
 
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
 SCALE = Parameter("scale", "1", 0.2, 5.0, log=True)  # delivered torque over the recorded one
 MOST_RIPPLE = 0.5  # of the torque of a motor, that ripples with it
-LEAST_KEPT = 0.1  # of a torque at any frequency, by its record
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
 
@@ -118,13 +118,7 @@ def record_roll_off(joint: int, place: str) -> Hypothesis:
     """
 
     def loss(p, s: np.ndarray) -> np.ndarray:
-        return np.maximum(1.0 + p[0] * (s**2).real, LEAST_KEPT)
-
-    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        return Screen(
-            (-(motion.group.omega**2) * motion.solution.U[..., j],),
-            np.array,
-        )
+        return recorded_share(s.imag, 0.0, p[0])
 
     return Hypothesis(
         "unknown:record_roll_off",
@@ -134,7 +128,7 @@ def record_roll_off(joint: int, place: str) -> Hypothesis:
         (Parameter("roll_off", "s2", -1e-2, 1e-2, step=1e-10),),
         lambda p, motion, j, k, U: U * loss(p, 1j * motion.group.omega),
         lambda scale: [()],
-        screen,
+        lambda motion, j, k, shape: Screen((-(motion.group.omega**2) * motion.solution.U[..., j],), np.array),
         "The record of the torque of {joint} changes its gain by {roll_off:.3g} s2 times the square of the frequency, as a"
         " recorder that averages or holds samples does; a short lag of the drive cannot be told from that here.",
         variable="torque",
