@@ -124,14 +124,14 @@ def carried_over(structure: Structure, nominal: Parameters, groups: Sequence[Gro
 
     left = np.zeros((2, structure.n))
     for part in range(PARTS):
-        kept, out = ([cut(group, part, inside) for group in groups] for inside in (False, True))
+        kept, out = ([_cut(group, part, inside) for group in groups] for inside in (False, True))
         found = fit_rigid(structure, nominal, kept).structure.model
         given, other = rows(kept), rows(out)
         left += [_left_with(model, indices, given, other) for model in (found, structure.model)]
     return float(np.exp(np.mean(np.log(left[0] / np.maximum(left[1], 1e-300)))))
 
 
-def cut(group: Group, part: int, inside: bool) -> Group:
+def _cut(group: Group, part: int, inside: bool) -> Group:
     """A motion seen through its window in one of ``PARTS`` of time, or outside of it; both fade at the cuts."""
     time = np.arange(group.n_time) * group.period_time / group.n_time
     length = time[np.flatnonzero(group.window).max()] / PARTS
