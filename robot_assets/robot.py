@@ -21,8 +21,9 @@ from robot_assets.values import MISSING, exists, number, read_toml, show, subtab
 ASSETS = Path(__file__).parent
 # Figures of a joint by other names that they go by.
 OTHER_NAMES = {
-    "damping": ("spring_damping",),
-    "viscous_friction": ("motor_viscous_friction",),
+    "stiffness": ("spring_stiffness", "gear_stiffness"),
+    "damping": ("spring_damping", "gear_damping"),
+    "viscous_friction": ("motor_viscous_friction", "motor_viscous", "viscous"),
     "torque_limit": ("torque_max", "effort_limit"),
     "velocity_limit": ("velocity_max",),
     "q_std": ("q_noise_std",),

@@ -1,10 +1,12 @@
 """Robot folders."""
 
+import re
+
 import numpy as np
 import pytest
 
 from robot_assets.errors import DataError
-from robot_assets.robot import load_robot
+from robot_assets.robot import OTHER_NAMES, load_robot
 
 
 def test_ur10_has_the_documented_figures(ur10):
@@ -66,6 +68,14 @@ def test_what_a_robot_may_leave_out_is_of_its_urdf_or_guessed(tmp_path):
     same = load_robot(tmp_path)
     assert same.payload_link == "l1" and np.array_equal(same.array("damping"), robot.array("damping"))
     assert np.all(same.array("q_std") == 2e-5) and np.all(same.array("torque_limit") == 9.0)
+
+
+@pytest.mark.parametrize(("key", "other"), [(key, other) for key, others in OTHER_NAMES.items() for other in others])
+def test_a_figure_goes_by_its_other_names(tmp_path, ur10, key, other):
+    """Each is read as the figure that it is another name of, which the text does not have then."""
+    bare = re.sub(rf"^{key} = .*\n", "", (ur10.folder / "robot.toml").read_text(), flags=re.M)
+    (tmp_path / "robot.toml").write_text(bare.replace("\ngear_ratio", f"\n{other} = 2.5\ngear_ratio"))
+    assert np.all(load_robot(tmp_path).array(key) == 2.5)
 
 
 def test_an_unknown_robot_lists_the_known_ones():
