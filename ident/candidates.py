@@ -105,7 +105,7 @@ def build_body(robot: Robot, rng: np.random.Generator) -> Body:
     """Kinematics of a robot and the pairs of its links that can collide."""
     model = pin.buildModelFromXML(completed(robot.urdf))
     model.gravity.linear = np.asarray(robot.gravity, float)
-    frames = {f.name: model.getFrameId(f.name) for f in model.frames if f.type == pin.FrameType.BODY}
+    frames = {f.name: i for i, f in enumerate(model.frames) if f.type == pin.FrameType.BODY}
     for load in robot.loads:
         frame = model.frames[frames[load.link]]
         inertia = pin.Inertia(load.mass, np.asarray(load.com), np.asarray(load.inertia))

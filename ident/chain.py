@@ -88,7 +88,7 @@ INERTIAL = (
 
 def _placed_loads(robot: Robot, source: pin.Model) -> list[tuple[str, pin.Inertia]]:
     """Loads that a robot names, each with its link, in the frame of the joint that carries that."""
-    places = {f.name: f.placement for f in source.frames if f.type == pin.FrameType.BODY}
+    places = {f.name: f.placement for f in _links(source)}
     for load in robot.loads:
         if load.link not in places:
             raise DataError("load", str(robot.folder), load.link, f"a link among {sorted(places)}")
@@ -125,7 +125,7 @@ def build_structure(
     model = pin.Model()
     model.name = robot.name
     model.gravity.linear = np.asarray(robot.gravity, float)
-    parent = {f.name: f.parentJoint for f in source.frames if f.type == pin.FrameType.BODY}
+    parent = {f.name: f.parentJoint for f in _links(source)}
     changed = {parent[link]: change for link, change in (links or {}).items()}
     known = inertias or {}
     placed = _placed_loads(robot, source)
@@ -146,7 +146,7 @@ def build_structure(
         if change.with_load and name not in known:
             body = sum((x for link, x in placed if parent[link] == i), body)
         model.appendBodyToJoint(carrier[i], change.of(body), pin.SE3.Identity())
-    bodies = {f.name: (carrier[f.parentJoint], f.placement) for f in source.frames if f.type == pin.FrameType.BODY}
+    bodies = {f.name: (carrier[f.parentJoint], f.placement) for f in _links(source)}
     for link, inertia in placed:
         if source.names[parent[link]] not in known and not changed.get(parent[link], LinkChange()).with_load:
             model.appendBodyToJoint(bodies[link][0], inertia, pin.SE3.Identity())
@@ -201,7 +201,30 @@ def _read_chain(
         q[joint.idx_q : joint.idx_q + joint.nq] = (
             [np.cos(angles[name]), np.sin(angles[name])] if joint.nq == 2 else [angles[name]]
         )
-    return pin.buildReducedModel(full, [full.getJointId(name) for name in free], q)
+    own = tell_links_apart(full)
+    reduced = pin.buildReducedModel(full, [full.getJointId(name) for name in free], q)
+    for frame in _links(reduced):
+        frame.name = own.get(frame.name, frame.name)
+    return reduced
+
+
+def tell_links_apart(model: pin.Model) -> dict[str, str]:
+    """Other names for the links of a model that share theirs with a joint, which Pinocchio cannot reduce.
+
+    Returns:
+        the names that these links had, by those that they have now.
+    """
+    joints = {f.name for f in model.frames if f.type != pin.FrameType.BODY}
+    own = {}
+    for frame in _links(model):
+        if frame.name in joints:
+            own[f"link:{frame.name}"] = frame.name
+            frame.name = f"link:{frame.name}"
+    return own
+
+
+def _links(model: pin.Model) -> list[pin.Frame]:
+    return [f for f in model.frames if f.type == pin.FrameType.BODY]
 
 
 def _joint_model(joint: pin.JointModel) -> pin.JointModel:

@@ -2,7 +2,7 @@
 
 Such a tone is in the scatter between periods, where it would count as noise. It stands at one line and leaks to those
 next to it, where noise of samples, carried to the torque by the impedance of the arm, is smooth over lines once that
-impedance is taken off.
+impedance is taken off. Where the impedance itself is sharp, links that still swing from how the record began look alike.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ REACH, NEXT = 12, 2  # lines on either side that say what noise is near by, but 
 LOUDEST = 10.0  # power of a line over that of noise near by, from which it is a tone
 QUIETEST = 0.01  # least power of noise near by, over that of all lines
 BY_CHANCE = 1e-9  # probability of such a line in noise anywhere
+SHARP = 2.0  # size of the impedance over that two lines away, from which links swing there on their own
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,24 @@ def find_tones(groups: Sequence[Group], impedances: Sequence[np.ndarray]) -> tup
             continue
         ratio, dof = over_noise(group, Z)
         chance = ratio.size * scipy.stats.gamma.sf(dof * ratio, dof)
-        for line, j in np.argwhere((ratio > LOUDEST) & (chance < BY_CHANCE)):
+        for line, j in np.argwhere((ratio > LOUDEST) & (chance < BY_CHANCE) & ~swinging(Z[: len(ratio)])):
             tone = Tone(int(j), float(group.omega[line] / (2.0 * np.pi)), float(ratio[line, j]))
             if tone.joint not in loudest or tone.ratio > loudest[tone.joint].ratio:
                 loudest[tone.joint] = tone
     return tuple(sorted(loudest.values(), key=lambda t: -t.ratio))
+
+
+def swinging(Z: np.ndarray) -> np.ndarray:
+    """(K, n) lines at and next to those where the torque of a joint has a sharp resonance of its own, the motors held.
+
+    Args:
+        Z: (K, n, n) torque per motor position.
+    """
+    size = np.log(np.maximum(np.linalg.norm(Z, axis=-1), 1e-300))
+    padded = np.pad(size, ((2, 2), (0, 0)), mode="edge")
+    sharp = size - 0.5 * (padded[:-4] + padded[4:]) > np.log(SHARP)
+    beside = np.pad(sharp, ((1, 1), (0, 0)))
+    return beside[:-2] | sharp | beside[2:]
 
 
 def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, float]:

@@ -1,5 +1,6 @@
 """The arms that come with the project: their figures, and that both models describe the same bodies."""
 
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import pinocchio as pin
 import pytest
 import scipy.linalg
 
+from ident.candidates import build_body
 from ident.chain import build_structure
 from ident.excitation import operating_points
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
@@ -34,6 +36,20 @@ def undamped_frequencies(structure, par, q_m):
     K = np.block([[np.diag(par.stiffness), -S.T], [-S, link]])
     free = scipy.linalg.eigh(K, scipy.linalg.block_diag(np.diag(par.inertia), lin.M), eigvals_only=True)
     return np.sqrt(held) / 2 / np.pi, np.sqrt(np.maximum(free[n:], 0)) / 2 / np.pi
+
+
+def test_links_may_bear_the_names_of_joints(irb, tmp_path):
+    """Which Pinocchio cannot tell apart by itself."""
+    for file in irb.folder.iterdir():
+        if file.is_file():
+            (tmp_path / file.name).write_text(re.sub(r"\blink_(\d)", r"joint_\1", file.read_text()))
+    same = load_robot(tmp_path)
+    ours, theirs = build_structure(irb), build_structure(same)
+    q = np.linspace(-0.5, 0.5, ours.model.nq)
+    assert np.array_equal(*(pin.crba(s.model, s.model.createData(), q) for s in (ours, theirs)))
+    assert sorted(theirs.bodies) == ["base_link", *irb.joint_names]
+    assert build_body(same, np.random.default_rng(0)).flange == build_body(irb, np.random.default_rng(0)).flange
+    assert build_plant(same).model.nv == build_plant(irb).model.nv
 
 
 def test_irb_has_six_springs_along_its_axes_and_six_across(irb):

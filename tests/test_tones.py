@@ -8,7 +8,7 @@ import pytest
 from ident.diagnosis import diagnose
 from ident.identification import identify
 from ident.problem import predictions
-from ident.tones import find_tones
+from ident.tones import find_tones, swinging
 from robot_assets.robot import load_robot
 from tests.conftest import quick_experiment, small_plan, through_files
 
@@ -41,6 +41,23 @@ def test_a_tone_off_the_lines_is_found_where_it_is(clean):
     first, *others = tones(setup.problem, fit)
     assert first.joint == 2 and abs(first.frequency_hz - 13.7) < 0.5 and first.ratio > 30.0
     assert not others
+
+
+@pytest.mark.parametrize(("damping", "told"), [(0.01, True), (0.5, False)])
+def test_a_resonance_of_the_links_is_where_they_swing(damping, told):
+    """Of one link on its gear, the motor held: torque per motor position ``k (k - J w^2) / (k - J w^2 + i d w)``."""
+    w, w0 = 2.0 * np.pi * 0.25 * np.arange(80), 2.0 * np.pi * 5.0
+    Z = 1e4 * (1.0 + w**2 / (w0**2 - w**2 + 2j * damping * w0 * w))
+    lines, joints = np.nonzero(swinging(Z[:, None, None]))
+    assert set(lines) == ({19, 20, 21} if told else set()) and not np.any(joints)
+
+
+@pytest.mark.slow
+def test_links_that_still_swing_from_the_start_are_no_tone():
+    """The links of the heavy arm swing at 5.5 Hz with little damping: one period of transient leaves some of it."""
+    plan = small_plan(load_robot("irb"), 3, levels=(1.0,))
+    setup, fit = identify(quick_experiment(plan, [], seed=3))
+    assert not tones(setup.problem, fit)
 
 
 def test_a_tone_that_repeats_with_the_period_is_no_scatter(clean):

@@ -9,7 +9,7 @@ import pinocchio as pin
 import rerun as rr
 import rerun.blueprint as rrb
 
-from ident.chain import build_structure
+from ident.chain import build_structure, tell_links_apart
 from ident.show.figures import frf_picture, rounded
 from ident.units import response_unit, torque_unit, unit_suffix, units_of_torques
 from ident.verdict import Diagnosis, TorqueTrace
@@ -175,6 +175,7 @@ def _log_meshes(stream: rr.RecordingStream, robot: Robot) -> bool:
         shapes = pin.buildGeomFromUrdfString(
             full, text, pin.GeometryType.COLLISION, package_dirs=[str(robot.mesh_dir or robot.folder)]
         )
+        tell_links_apart(full)
         fixed = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
         full, shapes = pin.buildReducedModel(full, shapes, fixed, _locked(full, robot))
     except Exception:  # Pinocchio raises many types for URDFs whose meshes are not there
