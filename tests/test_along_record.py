@@ -81,6 +81,7 @@ def test_the_mean_torque_is_met_and_the_law_is_the_law(code, seed, mean, size):
         assert h == pytest.approx(a * (x + offset) ** 3, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_law_that_is_nothing_leaves_what_the_loop_leaves(clean):
     """The residual along the record is that of the linear gear where the dead band has no width, but for the geometry
     along a slightly other motion of the links."""
@@ -100,6 +101,7 @@ def test_a_law_that_is_nothing_leaves_what_the_loop_leaves(clean):
             assert np.linalg.norm(left[0] - left[1]) < 0.05 * np.linalg.norm(left[0])
 
 
+@pytest.mark.slow
 def test_a_gear_that_rattles_is_explained_along_its_record_alone(rattling):
     """At the true parameters the loop ends in other steady states than the recording; the width is found along it."""
     problem, model, backlash, gap = rattling

@@ -287,6 +287,7 @@ def test_a_log_too_short_to_tell_causes_apart_is_said_to_be(arm, log):
         assert not any("of motion to fit in all" in w for w in inspect_dataset(dataset(arm, *segments)).warnings)
 
 
+@pytest.mark.slow
 def test_lost_motion_of_a_gear_is_no_skew_of_the_channels():
     """Friction that follows the motion late, by a twentieth of the stroke at each turn."""
     false = 0
@@ -329,6 +330,7 @@ def test_a_channel_of_some_segments_is_told_as_such(clean):
     assert any(w.startswith(f"q_link of joint 2 in 1 of {len(data.segments)} segments only") for w in report.warnings)
 
 
+@pytest.mark.slow
 def test_what_no_model_is_fitted_to_and_what_no_gain_is_measured_by_is_told(clean):
     data, _ = clean
     motion = next(s for s in data.segments if s.kind == "trajectory")

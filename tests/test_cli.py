@@ -77,6 +77,7 @@ def bench(tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_diagnose_takes_an_executor_and_a_time(bench, tmp_path):
     dataset, _ = bench
     run = simgap("diagnose", dataset, "--out", tmp_path / "out", "--executor", "cores")
@@ -148,6 +149,7 @@ def test_a_robot_that_does_not_match_is_one_line_and_overwrites_nothing(dataset,
     assert (out / "verdict.json").read_text() == "earlier"
 
 
+@pytest.mark.slow
 def test_shipped_real_data_are_diagnosed(tmp_path):
     out = tmp_path / "out"
     run = simgap("demo", "--real", "twomass", "--out", out, "--json", "--quiet")

@@ -44,6 +44,7 @@ def mapped(folder, text):
     return folder / "map.toml"
 
 
+@pytest.mark.slow
 def test_gaps_that_were_filled_are_told_by_the_conversion_and_by_the_check(tmp_path):
     t = np.arange(4000) / 200.0
     keep = np.ones(4000, bool)

@@ -71,6 +71,7 @@ def test_parts_fill_the_recording_and_every_sample_is_counted(ur10):
     assert spent.text().splitlines()[0].split()[:2] == ["moves", str(spent.moves)]
 
 
+@pytest.mark.slow
 def test_a_cut_recording_is_an_ordinary_dataset(recorded, tmp_path):
     schedule, recording, _ = recorded
     data = through_files(cut_recording(recording, schedule), tmp_path)
@@ -90,6 +91,7 @@ def test_a_cut_recording_is_an_ordinary_dataset(recorded, tmp_path):
     assert np.all(np.diff([s.t[0] for s in data.segments]) > 0)
 
 
+@pytest.mark.slow
 def test_frfs_and_parameters_agree_with_those_of_separate_experiments(recorded, ur10):
     schedule, recording, drives = recorded
     cut = cut_recording(recording, schedule)

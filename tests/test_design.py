@@ -199,6 +199,7 @@ def test_random_losses_are_those_of_their_sums():
         assert loss == pytest.approx(np.log(np.trace(np.linalg.inv(H[pick].sum(axis=0)))))
 
 
+@pytest.mark.slow
 def test_the_plan_holds_the_points_and_survives_its_file(ur10, tmp_path):
     design = design_experiment(ur10, points=3, candidates=60, draws=2, seed=4, realizations=2, period=2000)
     plan = design_plan(design, levels=(1.0, 0.5))
@@ -212,6 +213,7 @@ def test_the_plan_holds_the_points_and_survives_its_file(ur10, tmp_path):
     assert read.excitation.period == 2000
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_plan_that_the_experiment_takes(tmp_path, capsys, monkeypatch):
     def run(*words):
         monkeypatch.setattr("sys.argv", ["simgap", *map(str, words)])

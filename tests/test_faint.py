@@ -63,6 +63,7 @@ def test_an_effect_within_the_error_of_the_noise_is_found(ur10, tmp_path, faint,
         assert verdict.discrepancy.chi2_per_dof < DETECTION_EXCESS and verdict.discrepancy.p_value < 1e-6
 
 
+@pytest.mark.slow
 def test_noise_alone_shows_nothing_by_far(identified, hypotheses):
     _, setup, baseline = identified
     scores = faint_scores(setup.problem, baseline, hypotheses, np.zeros(6))
@@ -72,6 +73,7 @@ def test_noise_alone_shows_nothing_by_far(identified, hypotheses):
     assert not found.detected and not found.rounds and found.p_value > 1e-3
 
 
+@pytest.mark.slow
 def test_what_laws_already_found_may_leave_is_not_looked_at(identified, hypotheses):
     """At their joints; of what changes the chain, and shows at all of them, what the strongest may leave."""
     _, setup, baseline = identified
@@ -106,6 +108,7 @@ def test_errors_of_a_law_show_at_its_own_joint_first(identified, hypotheses, eff
     assert left_by_laws(replace(baseline, costs=costs), told) == pytest.approx(SHADOW * told)
 
 
+@pytest.mark.slow
 def test_a_noisier_joint_shows_less(identified, hypotheses):
     _, setup, baseline = identified
     scores = faint_scores(setup.problem, baseline, hypotheses, np.zeros(6))
@@ -129,6 +132,7 @@ def test_nothing_faint_is_sought_beside_link_encoders(identified, hypotheses):
     assert faint_scores(linked, baseline, hypotheses, np.zeros(6)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "colour", "found"), [(0.0, 1.0, False), (0.01, 1.0, True), (0.0, 20.0, False)])
 def test_of_single_periods_phases_tell_what_noise_explains(identified, hypotheses, size, colour, found):
     """Noise, an effect within it, and noise that rises towards the low lines of a joint, of which a few numbers explain
@@ -158,6 +162,7 @@ def test_of_single_periods_phases_tell_what_noise_explains(identified, hypothese
         assert friction in asked
 
 
+@pytest.mark.slow
 def test_coloured_noise_of_single_periods_is_no_discrepancy_and_an_effect_beside_it_is(locked, tmp_path):
     """Noise that is neither given nor repeated is guessed as white, from differences of samples that hardly show
     coloured noise."""
@@ -229,6 +234,7 @@ def test_nothing_faint_is_sought_beside_a_drift_and_the_verdict_tells_it(identif
     assert problem.structure.robot.joint_names[j] in note
 
 
+@pytest.mark.slow
 def test_a_law_along_the_record_hides_more_and_its_joint(identified, hypotheses):
     _, setup, baseline = identified
     h = along_record(next(h for h in hypotheses if h.key == ("backlash", "elbow_joint")))
@@ -403,6 +409,7 @@ def heard(monkeypatch, scores: list, result: Round) -> list:
     return asked
 
 
+@pytest.mark.slow
 def test_a_faint_round_asks_what_a_linear_step_puts_near_the_clearest(identified, hypotheses, monkeypatch):
     """And where nothing answers there, there is no discrepancy."""
     _, setup, baseline = identified

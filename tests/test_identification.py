@@ -77,6 +77,7 @@ def test_held_out_data_are_predicted_to_the_noise(clean, identified):
         assert share < 0.02
 
 
+@pytest.mark.slow
 def test_a_held_out_segment_that_ran_away_tells_nothing(clean):
     """Its error would outweigh all others."""
     data = clean[0]
@@ -185,6 +186,7 @@ def test_the_five_averages_agree_on_quiet_data(clean, estimator):
     assert np.median(np.abs(other.G - reference.G) / scale) < 0.01
 
 
+@pytest.mark.slow
 def test_a_ripple_that_is_fast_along_a_motion_does_not_fold_into_its_band(ur10):
     """The ripple passes at up to 40 Hz where the motion is compared below 3 Hz."""
     drives = draw_drives(np.random.default_rng(4), ur10)

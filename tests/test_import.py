@@ -376,6 +376,7 @@ def test_a_guessed_map_joins_files_of_one_value_a_line(tmp_path, pair):
     assert np.allclose(whole(data, "q"), q) and np.allclose(whole(data, "tau"), tau)
 
 
+@pytest.mark.slow
 def test_what_is_not_found_is_left_to_edit(tmp_path, pair):
     _, q, _, tau = motion()
     np.savez(tmp_path / "log.npz", position=q, alpha=tau, beta=tau)

@@ -64,6 +64,7 @@ def test_a_law_of_the_gear_is_named_by_link_encoders(ur10, tmp_path, text, figur
     assert "link encoder" in plot.y_label and np.std(left) < 0.2 * np.std(plot.model_y)
 
 
+@pytest.mark.slow
 def test_link_encoders_with_nothing_hidden_bring_no_cause(still):
     verdict = diagnose(still)
     assert not verdict.causes and not verdict.discrepancy.detected
@@ -148,6 +149,7 @@ def test_link_encoders_count_at_their_joints(still):
     assert data_counts(some) / data_counts(torque) == pytest.approx([1, 2, 1, 1, 2, 1])
 
 
+@pytest.mark.slow
 def test_multisines_are_compared_without_link_encoders(ur10, tmp_path):
     data = quick_experiment(small_plan(ur10, 13, points=1, levels=(1.0,)), [], seed=13, link_encoders=True)
     assert not comparable_links(set_up(through_files(data, tmp_path)).problem)

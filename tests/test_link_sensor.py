@@ -29,6 +29,7 @@ def test_a_late_link_encoder_is_named_and_no_other_cause(ur10, tmp_path, seed):
     assert verdict.discrepancy.detected and verdict.unexplained_verdict == "noise floor reached"
 
 
+@pytest.mark.slow
 def test_link_encoders_on_time_are_not_named(ur10, tmp_path):
     drives = draw_drives(np.random.default_rng(13), ur10)
     data = quick_experiment(

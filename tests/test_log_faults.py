@@ -160,6 +160,7 @@ def test_a_gain_of_some_joints_tells_of_all_of_them():
     assert gain.over_all == pytest.approx((np.sqrt(10.0), np.sqrt(8.5)))
 
 
+@pytest.mark.slow
 def test_outputs_that_cannot_be_made_are_one_line(tmp_path):
     log, given = written(tmp_path, {"tau": motion()[1], "q": motion()[1]}, '[columns]\ntau_1 = "tau"\nq_1 = "q"\n')
     convert = ("convert", log, "--robot", "twomass", "--map", given, "--out")

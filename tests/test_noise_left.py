@@ -139,6 +139,7 @@ def test_noise_that_is_given_stays(motions, ur10):
     assert np.array_equal(identify(given)[0].problem.tau_std, given.tau_std)
 
 
+@pytest.mark.slow
 def test_causes_are_sought_again_where_they_hid_how_little_noise_there_is(motions):
     told: list[str] = []
     verdict = diagnose(motions, progress=told.append)

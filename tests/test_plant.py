@@ -25,6 +25,7 @@ def run_of(plant):
     return Run(1, 1e-4, 1e-3, plant.robot, plant.drives, plant.model, np.zeros(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [None, "backlash@shoulder_pan_joint:gap=8e-4"])
 def test_the_step_of_an_experiment_is_far_below_its_noise(ur10, hidden):
     """Of a step half as long the records differ by less than a fiftieth of the noise, at every joint."""
@@ -150,6 +151,7 @@ def test_the_turn_of_a_dry_friction_is_solved(asked, size):
     assert x + size * np.tanh(x) == pytest.approx(asked, rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden",
     ["coulomb_friction@wrist_2_joint:torque=4,asymmetry=0.2", "dress_pack@wrist_2_joint:stiffness=5,friction=4"],

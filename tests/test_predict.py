@@ -143,6 +143,7 @@ def test_extended_filter_is_the_kalman_predictor_on_a_linear_arm(twomass):
     np.testing.assert_allclose(found.covariance, np.broadcast_to(k.Lambda, found.covariance.shape), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_extended_filter_predicts_the_whole_arm_of_another_engine(pair):
     """Geometry of the arm, far above the noise: the linear predictor misses it, the filter whitens it."""
     plan = plan_experiment(
@@ -188,6 +189,7 @@ def test_runs_that_begin_in_motion_are_predicted_from_there(pair):
         particle_filter(structure, runs)
 
 
+@pytest.mark.slow
 def test_particle_likelihood_converges_to_the_kalman_one(twomass):
     structure, par = twomass
     _, space = linear(structure, par)

@@ -104,6 +104,7 @@ def test_beside_an_encoder_in_steps_nothing_is_left_but_noise(tmp_path, seed):
     assert 0.85 < fit.chi2_per_dof < 1.15 and not np.any(drifting(setup.problem.groups))
 
 
+@pytest.mark.slow
 def test_what_circulates_in_the_loop_is_no_rounding_that_averages_out(tmp_path):
     """Positions differ from period to period by more than their errors do: at joint 2 of the IRB by twice as much."""
     robot = load_robot("irb")

@@ -124,6 +124,7 @@ def test_friction_at_rest_is_what_the_drive_asks_of_it():
     assert parts.shape == (8, 1) and parts.mean(axis=0) == pytest.approx(mean_squares(np.abs(lines) ** 2)[0], rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asymmetry", [-0.3, 0.5])
 def test_friction_that_differs_with_direction_balances_at_rest_what_is_asked_of_it(asymmetry):
     verdict = diagnose(moves_with_dwells(0.8, asymmetry=asymmetry), max_causes=2)

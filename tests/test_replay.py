@@ -76,6 +76,7 @@ def test_the_impedance_of_the_file_is_that_of_the_model():
     assert np.allclose(hold, prediction.plane.lin.g[driven], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multisine", "trajectory"])
 def test_a_true_model_needs_the_torque_that_was_recorded(clean_drive, kind):
     """Nothing hidden and the true parameters: what is left is the noise, of which the slow motion has more."""

@@ -91,6 +91,7 @@ def single(tmp_path_factory):
     return through_files(replace(data, segments=segments, input_hold="none"), tmp_path_factory.mktemp("single"))
 
 
+@pytest.mark.slow
 def test_of_a_single_joint_it_is_found_among_the_causes_and_is_none(single):
     verdict = diagnose(single)
     assert [c.effect for c in verdict.causes if c.probability > 0.5] == ["gravity_spring"]

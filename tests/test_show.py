@@ -241,6 +241,7 @@ def diagnosis(ur10):
     return Diagnosis(verdict, ur10, ur10.joint_names, views, spectrum, (plot,), (trace,), parameters(ur10), 1.0)
 
 
+@pytest.mark.slow
 def test_all_outputs_are_written_whole(diagnosis, tmp_path):
     write_outputs(diagnosis, tmp_path / "out")
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
@@ -263,6 +264,7 @@ def test_all_outputs_are_written_whole(diagnosis, tmp_path):
     assert (tmp_path / "out" / "recording.rrd").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_next_plan_is_written_and_an_old_one_taken_away(diagnosis, ur10, tmp_path):
     plan = make_plan(ur10, points=1, validation_points=0, period=500, trajectory=False)
     write_outputs(replace(diagnosis, next_plan=plan), tmp_path / "out")
@@ -273,6 +275,7 @@ def test_the_next_plan_is_written_and_an_old_one_taken_away(diagnosis, ur10, tmp
     assert not (tmp_path / "out" / "next_plan.toml").exists()
 
 
+@pytest.mark.slow
 def test_torques_are_shown_at_the_joints_of_the_gain_first():
     """The other places go to the joints where the baseline errs most, relative to their torque."""
     joints = tuple("abcdef")

@@ -36,6 +36,7 @@ def test_ends_of_periods_are_taken_off(identified):
     assert problem.groups[0].U is setup.problem.groups[0].U
 
 
+@pytest.mark.slow
 def test_a_link_that_goes_on_swinging_is_no_noise():
     """Hardly damped, it is excited by noise in the loop; its noise had been 70 times too large at the resonance."""
     robot = load_robot("twomass")
@@ -44,6 +45,7 @@ def test_a_link_that_goes_on_swinging_is_no_noise():
     assert setup.problem.tau_std == pytest.approx(robot.array("tau_std"), rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 1.5])
 def test_nothing_is_taken_off_where_a_model_is_far_from_the_data(clean, monkeypatch, scale):
     """A part of what is missing would go with it."""

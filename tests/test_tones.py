@@ -35,6 +35,7 @@ def test_noise_alone_holds_no_tone(identified):
     assert not tones(setup.problem, fit)
 
 
+@pytest.mark.slow
 def test_a_tone_off_the_lines_is_found_where_it_is(clean):
     data, _ = clean
     setup, fit = identify(with_tone(data, 2, 13.7, 0.3))
@@ -60,6 +61,7 @@ def test_links_that_still_swing_from_the_start_are_no_tone():
     assert not tones(setup.problem, fit)
 
 
+@pytest.mark.slow
 def test_a_tone_that_repeats_with_the_period_is_no_scatter(clean):
     data, _ = clean
     setup, fit = identify(with_tone(data, 2, 13.0, 0.3))

@@ -134,6 +134,7 @@ def test_presliding_friction_is_the_lugre_law():
     assert np.abs(law - stiffness * found.y[0]).max() > 0.2 * coulomb
 
 
+@pytest.mark.slow
 def test_the_record_says_what_friction_holds_where_a_motion_begins(ur10, tmp_path):
     """The motion that closes a recording was not made, and leaves nothing in the bristles."""
     hidden = parse_effect("presliding_friction@elbow_joint:stiffness=2000,coulomb=8", ur10)
