@@ -29,13 +29,13 @@ from ident.identification import (
     with_noise_of_fast_lines,
 )
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
-from ident.model import Effect
+from ident.model import Effect, Model
 from ident.next_experiment import separating_experiment
 from ident.parallel import Workers, one_thread_each
 from ident.period_checks import unrepeated
-from ident.problem import NOT_COMPUTED, predictions
+from ident.problem import NOT_COMPUTED, Problem, predictions
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
-from ident.rigid import RigidFit, carried_over, fit_rigid
+from ident.rigid import RigidFit, carried_over, cut, fit_rigid
 from ident.tones import Tone, find_tones
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit, fit
@@ -51,6 +51,9 @@ SETTLED_BY_INERTIAS = 0.7
 # them
 CARRIED_OVER = 0.9
 LEFT_TO_LINKS = 1e-3  # share of the discrepancy up to which errors of the laws of causes, not links, are what is left
+PARTS = 8  # of the motions, left out in turn to see which inertias foretell them
+TOWARDS = 0.68  # level of the interval that says so: neither choice is the safe one
+AGAIN = 4  # iterations of a fit to records of which a part is left out
 MAX_SECONDS = 600.0  # of search for causes
 SEED = 0
 
@@ -145,8 +148,6 @@ def diagnose_fully(
         )
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
-    if rigid is not None and setup.held_out:
-        notes.append("Held-out motions took part in the choice between these inertias and those of the description.")
     notes += [f"Not used: {line}." for line in not_fitted(given)]
     if problem.sampling.roll_off:
         notes.append(roll_off_note(problem))
@@ -326,7 +327,8 @@ def with_inertias(
     if left_over(baseline, result.baseline) > 1.0:  # no better to begin with than the links of the description
         return setup, result, None
     other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
-    if not worth_it(left_over(other.final, result.final), foretold(setup, result.final, other.final)):
+    left = left_over(other.final, result.final)
+    if left > 1.0 or not worth_it(left, foretold(setup, result.final, other.final, workers)):
         return setup, result, None
     return replace(setup, problem=problem), other, rigid
 
@@ -343,25 +345,58 @@ def inertias_foretell(setup: Setup) -> bool:
         return False
 
 
-def worth_it(left: float, held_out: tuple[float, float]) -> bool:
+def worth_it(left: float, left_out: tuple[float, float]) -> bool:
     """Whether inertias found are kept, by what they leave over what is left without.
 
     Args:
         left: of the motions that were fitted (``left_over``). Both sides have causes of their own, sought apart, which
             makes this rough.
-        held_out: interval of the same on held-out motions (``foretold``).
+        left_out: interval of the same on parts of them that were not (``foretold``).
     """
-    least, most = held_out
+    least, most = left_out
     return least <= 1.0 and (left <= SETTLED_BY_INERTIAS or (left <= 1.0 and most < 1.0))
 
 
-def foretold(setup: Setup, one: Fit, other: Fit) -> tuple[float, float]:
-    """Interval of what ``other`` leaves of held-out motions over what ``one`` leaves there (``ratio_interval``); (0,
-    inf) where none are held out."""
-    if not setup.held_out:
-        return 0.0, np.inf
-    errors, _ = segment_errors(setup.problem, setup.held_out, one.model, other.model)
-    return ratio_interval(errors, np.random.default_rng(SEED))
+def foretold(setup: Setup, one: Fit, other: Fit, workers: Workers) -> tuple[float, float]:
+    """Interval of what ``other``, of inertias found, leaves of parts of the motions over what ``one`` leaves there
+    (``ratio_interval``), both fitted again without these parts; (inf, inf) where they cannot be.
+
+    Motions that are held out take no part in the choice: they measure what it gains.
+    """
+    problem = setup.problem
+
+    def without(part: int) -> Errors:
+        kept, out = ([cut(group, part, PARTS, inside) for group in problem.groups] for inside in (False, True))
+        models = [refitted(problem, kept, start, start is other, start.remainders) for start in (one, other)]
+        return segment_errors(problem, out, *models)[0]
+
+    try:
+        errors = joined(workers.map(without, range(PARTS)))
+    except NOT_COMPUTED:
+        return np.inf, np.inf
+    return ratio_interval(errors, np.random.default_rng(SEED), TOWARDS)
+
+
+def refitted(
+    problem: Problem, groups: Sequence[Group], start: Fit, renewed: bool, remainders: Sequence[np.ndarray]
+) -> Model:
+    """The model of a fit on other records.
+
+    Args:
+        renewed: whether the inertias of the links are found from these too.
+        remainders: of these records, from which the fit starts.
+    """
+    model, problem = start.model, replace(problem, groups=tuple(groups))
+    if renewed:
+        links = fit_rigid(build_structure(problem.structure.robot), problem.nominal, groups)
+        model, problem = replace(model, structure=links.structure), replace(problem, nominal=links.par)
+    return fit(problem, model, iterations=AGAIN, remainders=list(remainders)).model
+
+
+def joined(errors: Sequence[Errors]) -> Errors:
+    """Errors one below the other."""
+    names = tuple(name for e in errors for name in e.segments)
+    return Errors(names, *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")))
 
 
 def left_over(one: Fit, other: Fit) -> float:
@@ -399,24 +434,15 @@ def leave_one_out(
             tuple(g for g, name in zip(problem.groups, of, strict=True) if (name == point) is out)
             for out in (True, False)
         )
-        part = replace(problem, nominal=nominal, groups=kept)
         models = []
         for start in (baseline, result.final):
             remainders = [W for W, name in zip(start.remainders, of, strict=True) if name != point]
-            model, data = start.model, part
-            if renewed and start is result.final:
-                links = fit_rigid(build_structure(problem.structure.robot), nominal, part.groups)
-                model, data = replace(model, structure=links.structure), replace(part, nominal=links.par)
-            models.append(fit(data, model, iterations=4, remainders=remainders).model)
+            found = renewed and start is result.final
+            models.append(refitted(replace(problem, nominal=nominal), kept, start, found, remainders))
         return segment_errors(problem, left_out, *models, alone=False)[0]
 
-    errors = workers.map(without, points)
-    joined = Errors(
-        tuple(n for e in errors for n in e.segments),
-        *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")),
-    )
     return measure_gain(
-        joined,
+        joined(workers.map(without, points)),
         units_of_torques(problem.structure.robot),
         affected,
         LEFT_OUT,

@@ -153,7 +153,8 @@ def occam(candidate: Candidate, temper: float) -> float:
     ``-log det(1 + P L / temper) / 2`` with the spread ``P`` of its parameters before the data and their
     information ``L`` with all other coordinates free (Laplace's approximation: MacKay, Neural Comput. 4,
     1992), and the density of the values themselves where there is a prior. A parameter that the data do
-    not determine costs nothing, nor does one that they find absent, unless it is what makes the effect.
+    not determine costs nothing. One that they find absent costs what they lose without it, and more where it is what
+    makes the effect.
     """
     effect = candidate.fit.model.effects[-1]
     ps = effect.hypothesis.parameters
@@ -162,13 +163,13 @@ def occam(candidate: Candidate, temper: float) -> float:
     nulls = np.array([np.nan if q.null is None else q.to_internal(q.null) for q in ps])
     covariance = temper * inverse(H, STEADY)[-len(ps) :, -len(ps) :]
     absent = np.abs(x - nulls) < ABSENT * np.sqrt(np.diag(covariance))
+    without = 0.0
     if np.any(absent):
         # Those that the data only know together can each be at their nulls, and not all of them.
         off = (x - nulls)[absent]
-        if off @ inverse(covariance[np.ix_(absent, absent)], STEADY) @ off > scipy.stats.chi2.isf(
-            ABSENT_LEVEL, len(off)
-        ):
-            absent[:] = False
+        without = float(off @ inverse(covariance[np.ix_(absent, absent)], STEADY) @ off)
+        if without > scipy.stats.chi2.isf(ABSENT_LEVEL, len(off)):
+            absent[:], without = False, 0.0
     keep = np.concatenate([np.ones(len(H) - len(ps), bool), ~absent])
     count = int(np.sum(~absent))
     options = effect.hypothesis.options
@@ -177,7 +178,7 @@ def occam(candidate: Candidate, temper: float) -> float:
     stiffness = candidate.fit.model.par.stiffness[effect.hypothesis.joint]
     nats = POINTLESS_NATS * (nothing or pointless(effect, stiffness))
     if count == 0:
-        return -nats
+        return -0.5 * without - nats
     own = np.linalg.inv(inverse(H[np.ix_(keep, keep)], STEADY)[-count:, -count:])
     amplitude = np.hypot(*(v for q, v in zip(ps, effect.p, strict=True) if q.name in WAVE)) if is_wave(ps) else 0.0
     spread = np.array(
@@ -185,7 +186,7 @@ def occam(candidate: Candidate, temper: float) -> float:
     )[~absent] * options.get("of_size", lambda p: 1.0)(effect.p)
     narrowed = np.linalg.slogdet(np.eye(count) + own * np.outer(spread, spread) / temper)[1]
     density = sum(((v - q.prior_center(stiffness)) / q.spread) ** 2 for q, v in zip(ps, x, strict=True))
-    return float(-0.5 * narrowed - 0.5 * density - nats)
+    return float(-0.5 * narrowed - 0.5 * density - 0.5 * without - nats)
 
 
 def pointless(effect: Effect, stiffness: float) -> bool:

@@ -154,9 +154,9 @@ def measure_gain(
     return Gain(told, f"{metric}, {unit}", before, after, noise, closed, interval, method, of, by_joint)
 
 
-def ratio_interval(errors: Errors, rng: np.random.Generator) -> tuple[float, float]:
-    """95 % interval of the squares left after, over those left before, at each joint no less than noise; geometric mean
-    over the joints.
+def ratio_interval(errors: Errors, rng: np.random.Generator, level: float) -> tuple[float, float]:
+    """Interval of this level of the squares left after, over those left before, at each joint no less than noise;
+    geometric mean over the joints.
 
     A percentile bootstrap over the rows of ``errors``; (0, inf) where there are too few for one.
     """
@@ -165,5 +165,5 @@ def ratio_interval(errors: Errors, rng: np.random.Generator) -> tuple[float, flo
     pick = rng.integers(len(errors.segments), size=(RESAMPLES, len(errors.segments)))
     before, after, noise = (x[pick].mean(axis=1) for x in (errors.before, errors.after, errors.noise))
     logs = np.log(np.maximum(after, noise)) - np.log(np.maximum(before, noise))
-    low, high = np.quantile(np.exp(logs.mean(axis=1)), [0.025, 0.975])
+    low, high = np.quantile(np.exp(logs.mean(axis=1)), [0.5 - 0.5 * level, 0.5 + 0.5 * level])
     return float(low), float(high)

@@ -124,19 +124,19 @@ def carried_over(structure: Structure, nominal: Parameters, groups: Sequence[Gro
 
     left = np.zeros((2, structure.n))
     for part in range(PARTS):
-        kept, out = ([_cut(group, part, inside) for group in groups] for inside in (False, True))
+        kept, out = ([cut(group, part, PARTS, inside) for group in groups] for inside in (False, True))
         found = fit_rigid(structure, nominal, kept).structure.model
         given, other = rows(kept), rows(out)
         left += [_left_with(model, indices, given, other) for model in (found, structure.model)]
     return float(np.exp(np.mean(np.log(left[0] / np.maximum(left[1], 1e-300)))))
 
 
-def _cut(group: Group, part: int, inside: bool) -> Group:
-    """A motion seen through its window in one of ``PARTS`` of time, or outside of it; both fade at the cuts."""
+def cut(group: Group, part: int, parts: int, inside: bool) -> Group:
+    """A motion seen through its window in one of so many parts of time, or outside of it; both fade at the cuts."""
     time = np.arange(group.n_time) * group.period_time / group.n_time
-    length = time[np.flatnonzero(group.window).max()] / PARTS
+    length = time[np.flatnonzero(group.window).max()] / parts
     # No cut where the record itself begins or ends.
-    begins, ends = part * length if part else -np.inf, (part + 1) * length if part < PARTS - 1 else np.inf
+    begins, ends = part * length if part else -np.inf, (part + 1) * length if part < parts - 1 else np.inf
     depth = np.minimum(time - begins, ends - time)
     fade = np.clip((depth if inside else -depth) / CROSSING, 0.0, 1.0)
     return replace(group, window=group.window * np.sin(0.5 * np.pi * fade) ** 2)
