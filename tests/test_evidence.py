@@ -36,7 +36,7 @@ from ident.hypotheses.bodies import LOAD_NATS, link_inertia, payload, payload_li
 from ident.hypotheses.drive import torque_saturation
 from ident.hypotheses.hinges import hinge_inertia
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
-from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
+from ident.hypotheses.sensing import encoder_eccentricity, position_scale, torque_offset
 from ident.hypotheses.structure import apply_change
 from ident.identification import identify
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, plane_at, solve, stalled
@@ -1050,6 +1050,36 @@ def test_where_a_body_answers_best_those_near_it_are_tried_too(named):
     assert other_bodies(found, tried, scores) == [scores[3]]
     better = [*found, (rub.hypothesis, SimpleNamespace(cost=0.5))]
     assert other_bodies(better, tried, scores) == [] == other_bodies([], tried, scores)
+
+
+def test_a_position_recorded_too_large_is_no_encoder_out_of_centre(clean):
+    """Where a joint turns little both change its position by a share; over all postures the shares differ."""
+    data, _ = clean
+    j = data.joints.index("elbow_joint")
+    wrong = tuple(replace(s, q=s.q * np.where(np.arange(len(data.joints)) == j, 1.03, 1.0)) for s in data.segments)
+    setup, first = identify(replace(data, segments=wrong))
+    problem = setup.problem
+    laws = (position_scale(j, "elbow_joint"), [1.01]), (encoder_eccentricity(j, "elbow_joint"), [0.01, 0.01])
+    models = (replace(first.model, effects=(Effect(h, np.array(start)),)) for h, start in laws)
+    scaled, turned = (fit(problem, model, remainders=first.remainders) for model in models)
+    assert scaled.model.effects[0].p[0] == pytest.approx(1.03, rel=1e-3)
+    assert scaled.chi2_per_dof < 1.2 and turned.chi2_per_dof > 5.0
+
+
+def test_a_limit_above_the_slow_torque_is_begun_from_where_the_fast_torque_meets_it():
+    """Of a motion the slow part alone is compared; what the limit takes of the fast part is seen in that."""
+    slow = 100.0 * np.sin(np.linspace(0.0, 2.0 * np.pi, 500))[None]
+    fast = np.random.default_rng(0).normal(0.0, 4.0, (400, 500))
+    taken = np.mean(slow + fast - np.clip(slow + fast, -103.0, 103.0), axis=0)[None]
+    motion = SimpleNamespace(torque=lambda j: slow, peak_torque=lambda j: 100.0, usual_torque=lambda j: 70.0)
+    h = torque_saturation(0, "joint")
+    starts = []
+    for shape in h.shapes(SimpleNamespace(peak_torque=100.0)):
+        found = h.screen(motion, 0, 0.0, shape)
+        unit = found.signals[0]
+        starts.append(found.start([np.sum(unit * taken) / np.sum(unit**2)]))
+    begun = [p[0] for p in starts if p is not None]
+    assert begun and all(p == pytest.approx(103.0, rel=0.05) for p in begun)
 
 
 def test_decoys_take_no_place_of_a_named_one(named):

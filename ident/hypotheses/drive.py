@@ -156,7 +156,8 @@ def torque_saturation(joint: int, place: str, wound_up: bool = False) -> Hypothe
 
     def shapes(scale: SignalScale) -> list[tuple[float, float]]:
         if not wound_up:
-            return [(f * scale.peak_torque, KNEE.center) for f in (0.5, 0.65, 0.8, 0.9, 0.96)]
+            # Torque that is fast against the compared band meets a limit that its slow part stays below.
+            return [(f * scale.peak_torque, KNEE.center) for f in (0.5, 0.65, 0.8, 0.9, 0.96, 1.0, 1.03)]
         low = scale.exceeded_torque
         return [(f * low, KNEE.center) for f in (1.0, 1.4)] if 1.4 * low < LEAST_LIMIT * scale.peak_torque else []
 

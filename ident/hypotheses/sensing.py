@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.hypotheses.drive import SCALE, scale_of
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.motion import Motion
 
@@ -94,6 +95,28 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         screen,
         "The encoder of {joint} errs by {amplitude:.3g} rad once a turn.",
         variable="q",
+    )
+
+
+def position_scale(joint: int, place: str) -> Hypothesis:
+    """Decoy: measured position is ``scale`` times the true one, as with a wrong number of counts or teeth. An encoder
+    that is out of centre does nearly that where it turns little."""
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        return (1.0 / p[0] - 1.0) * motion.lines(motion.q(j))
+
+    return Hypothesis(
+        "unknown:position_scale",
+        place,
+        joint,
+        "position",
+        (SCALE,),
+        law,
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen((-motion.lines(motion.q(j)),), lambda c: np.array([scale_of(-c[0])])),
+        "The position of {joint} is recorded {scale:.4g} times as large as it is.",
+        variable="q",
+        options={"filter": lambda p, s: np.full(len(s), 1.0 / p[0])},
     )
 
 
