@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ident.dataset import Dataset
 from ident.evidence import Candidate, pointless
 from ident.extended import Prediction
 from ident.hypotheses import Hypothesis
+from ident.hypotheses.hypothesis import RIPPLE
 from ident.link_sensor import LinkDelay
 from ident.model import Effect, is_along_record
 from ident.next_experiment import NextExperiment, advice
@@ -84,6 +85,7 @@ def conclude(
         rigid: inertias of the links where they were found too: ``result`` is then about the model with them.
     """
     final = result.final
+    tones = of_their_own(tones, final)
     left = result.left_share if result.detected else 0.0
     halved = gain is not None and gain.method == LEFT_OUT and len({g.operating_point for g in problem.groups}) < 3
     refuted = result.unknown or fails_held_out(gain, final, left, halved) or patchwork(named_effects(final))
@@ -192,7 +194,23 @@ def nameless_note(effect: Effect, structure: Structure) -> str:
     """What a model was extended by that is no effect of the catalogue, in a sentence."""
     h = effect.hypothesis
     numbers = {q.name: v for q, v in zip(h.parameters, effect.p, strict=True)}
-    return text_at(h.sentence, at_linear_joint(effect, structure)).format(joint=h.place, **numbers)
+    return told(effect, structure, numbers)
+
+
+def told(effect: Effect, structure: Structure, numbers: Mapping[str, float]) -> str:
+    """An effect in a sentence, with the values of its parameters and with how often it repeats."""
+    h = effect.hypothesis
+    linear, joints = at_linear_joint(effect, structure), h.options.get("joints", ())
+    wave = waves(numbers[RIPPLE], structure.robot.joints[h.joint].gear_ratio, linear) if RIPPLE in numbers else ""
+    return text_at(h.sentence, linear).format(joint=h.place, turned=joints[-1] if joints else "", wave=wave, **numbers)
+
+
+def waves(number: float, gear_ratio: float, linear: bool) -> str:
+    """How often something repeats, by its wave number, rad of it per rad or m of the joint."""
+    if linear:
+        return f"once in {2.0 * np.pi / number:.3g} m"
+    of_motor = "" if gear_ratio == 1.0 else f", {number / gear_ratio:.4g} of its motor"
+    return f"{number:.4g} times a turn of the joint{of_motor}"
 
 
 def at_linear_joint(effect: Effect, structure: Structure) -> bool:
@@ -249,6 +267,14 @@ def roll_off_note(problem: Problem) -> str:
         " by the square of the frequency and alike at all joints. That is taken for the recorder, which averages samples or"
         " holds them, and not for a cause."
     )
+
+
+def of_their_own(tones: Sequence[Tone], final: Fit) -> tuple[Tone, ...]:
+    """Tones at joints of which no nonlinear law is known: what sticks, slips or rattles need not repeat with the
+    period."""
+    laws = (e.hypothesis for e in named_effects(final))
+    bent = {h.joint for h in laws if not h.on_chain and "filter" not in h.options}
+    return tuple(x for x in tones if x.joint not in bent)
 
 
 def tone_note(tone: Tone, joint: str) -> str:
@@ -315,15 +341,12 @@ def _cause(effect: Effect, candidates: Sequence[Candidate], final: Fit, covarian
             name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
             others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
     parameters = reported_parameters(effect, final, covariance)
-    numbers = {k: v.value for k, v in parameters.items()}
     return Cause(
         effect=h.effect,
         joint=h.place,
         parameters=parameters,
         probability=float(np.clip(own * trust, 0.0, 0.999)),
-        evidence=text_at(h.sentence, at_linear_joint(effect, final.model.structure)).format(
-            joint=h.place, turned=joints[-1] if joints else "", **numbers
-        ),
+        evidence=told(effect, final.model.structure, {k: v.value for k, v in parameters.items()}),
         alternatives=tuple(
             Alternative(e, p, float(v * trust)) for (e, p), v in sorted(others.items(), key=lambda x: -x[1])
         ),

@@ -1,14 +1,19 @@
 """Tones that do not repeat with the period of the excitation, against the noise that carries them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from ident.chain import build_structure
+from ident.conclude import of_their_own
 from ident.diagnosis import diagnose
+from ident.hypotheses import catalogue
 from ident.identification import identify
+from ident.model import Effect
 from ident.problem import predictions
-from ident.tones import find_tones, swinging
+from ident.tones import Tone, find_tones, swinging
 from robot_assets.robot import load_robot
 from tests.conftest import quick_experiment, small_plan, through_files
 
@@ -72,6 +77,13 @@ def test_records_without_noise_hold_no_tone():
     robot = load_robot("twomass")
     setup, fit = identify(quick_experiment(small_plan(robot, 3, period=1000, levels=(4.0,)), [], seed=3, noise=0.0))
     assert not tones(setup.problem, fit)
+
+
+@pytest.mark.parametrize(("effect", "left"), [("coulomb_friction", ()), ("torque_lag", (0,)), ("payload", (0,))])
+def test_a_joint_that_sticks_need_not_repeat(ur10, effect, left):
+    h = next(h for h in catalogue(build_structure(ur10)) if h.effect == effect)
+    found = SimpleNamespace(model=SimpleNamespace(effects=(Effect(h, np.ones(len(h.parameters))),)))
+    assert tuple(x.joint for x in of_their_own([Tone(0, 3.0, 20.0)], found)) == left
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.02])

@@ -1,9 +1,10 @@
 """Units of parameters at rotary and at linear joints."""
 
+import numpy as np
 import pytest
 
 from ident.chain import build_structure
-from ident.conclude import at_linear_joint
+from ident.conclude import at_linear_joint, told, waves
 from ident.hypotheses import catalogue
 from ident.model import Effect
 from ident.units import (
@@ -58,6 +59,21 @@ def test_no_effect_of_a_linear_joint_is_told_in_radians():
         assert " rad" not in said and "N m" not in said, said
         told += 1
     assert told > 20
+
+
+def test_what_repeats_is_counted_by_turns_of_joint_and_motor_or_by_length():
+    assert waves(2880.0, 160.0, False) == "2880 times a turn of the joint, 18 of its motor"
+    assert waves(4.0, 1.0, False) == "4 times a turn of the joint"
+    assert waves(2.0 * np.pi / 0.01, 500.0, True) == "once in 0.01 m"
+
+
+@pytest.mark.parametrize("name", ["ur10", "emps"])
+def test_every_effect_is_told_by_its_parameters(name):
+    structure = build_structure(load_robot(name))
+    for h in catalogue(structure):
+        names = [*(q.name for q in h.parameters), "amplitude", "phase", "axis_x", "axis_y", "axis_z"]
+        said = told(Effect(h, None), structure, dict.fromkeys(names, 2.5))
+        assert "{" not in said and said.endswith("."), h.key
 
 
 def test_a_sentence_of_a_rotary_joint_stays():

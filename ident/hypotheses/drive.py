@@ -206,8 +206,7 @@ def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothe
         law,
         lambda scale: [(n,) for n in scale.wave_numbers],
         screen,
-        "The residual torque of {joint} is periodic in its motor angle: {amplitude:.3g} N m,"
-        " {periods_per_rev:.4g} periods a turn of the joint.",
+        "The residual torque of {joint} is periodic in its motor angle: {amplitude:.3g} N m, {wave}.",
         variable="q",
     )
 

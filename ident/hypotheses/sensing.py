@@ -93,7 +93,8 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         law,
         lambda scale: [()],
         screen,
-        "The encoder of {joint} errs by {amplitude:.3g} rad once a turn.",
+        "The encoder of {joint} errs by {amplitude:.3g} rad once a turn of "
+        + ("its motor." if turns != 1.0 else "the joint."),
         variable="q",
     )
 

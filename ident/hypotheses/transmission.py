@@ -207,8 +207,7 @@ def transmission_error(joint: int, place: str) -> Hypothesis:
         lambda p, motion, j, k: parts(p, motion, j),
         lambda scale: [(n, 1.0) for n in scale.wave_numbers],
         screen,
-        "The gear of {joint} has a kinematic error of {amplitude:.3g} rad, {periods_per_rev:.4g} periods a turn"
-        " of the joint: a ripple that grows near resonance.",
+        "The gear of {joint} has a kinematic error of {amplitude:.3g} rad, {wave}: a ripple that grows near resonance.",
         variable="q",
         options={"kinematic": True},
     )
