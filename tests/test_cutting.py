@@ -159,6 +159,7 @@ def test_a_plan_that_cannot_be_run_is_refused(recorded):
         schedule_plan(plan, settle=-1.0)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_dataset_and_counts_its_samples(tmp_path):
     args = ["experiment", "twomass", "--out", str(tmp_path / "d"), "--points", "1", "--one-recording", "--json"]
     run = subprocess.run(
