@@ -62,11 +62,10 @@ def swinging(Z: np.ndarray) -> np.ndarray:
     Args:
         Z: (K, n, n) torque per motor position.
     """
-    size = np.log(np.maximum(np.linalg.norm(Z, axis=-1), 1e-300))
+    size = np.log(np.maximum(np.linalg.norm(Z[1:], axis=-1), 1e-300))  # at rest it may be next to nothing
     padded = np.pad(size, ((2, 2), (0, 0)), mode="edge")
-    sharp = size - 0.5 * (padded[:-4] + padded[4:]) > np.log(SHARP)
-    beside = np.pad(sharp, ((1, 1), (0, 0)))
-    return beside[:-2] | sharp | beside[2:]
+    sharp = np.pad(size - 0.5 * (padded[:-4] + padded[4:]) > np.log(SHARP), ((2, 1), (0, 0)))
+    return sharp[:-2] | sharp[1:-1] | sharp[2:]
 
 
 def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, float]:
