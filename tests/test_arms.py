@@ -114,7 +114,7 @@ def test_irb_wrist_is_ruled_by_its_motors(irb):
         assert np.all(irb.array("motor_inertia")[3:] > np.diag(M)[structure.driven][3:])
 
 
-@pytest.mark.parametrize("name", ["ur10", "irb", "panda"])
+@pytest.mark.parametrize("name", ["ur10", *(pytest.param(x, marks=pytest.mark.slow) for x in ("irb", "panda"))])
 def test_experiments_stay_within_the_limits_of_the_arm(name):
     robot = load_robot(name)
     plan = small_plan(robot, 2, points=2, levels=(1.0,), period=1000, periods=2, band_hz=(1.0, 60.0), trajectory=True)

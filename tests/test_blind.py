@@ -194,6 +194,7 @@ def test_friction_of_a_link_extends_the_model_and_gets_no_name(ur10, tmp_path):
     assert damping == pytest.approx(coefficient, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_base_that_leans_is_no_cause_of_the_catalogue(ur10, tmp_path):
     """By two degrees: every joint that bears gravity asks for something, and no name explains that."""
     plan = small_plan(ur10, 12, levels=(1.0,), period=1000)

@@ -1146,6 +1146,7 @@ def test_a_round_that_is_renamed_loses_no_probability(named):
     assert [[c.probability for c in r.candidates] for r in again] == [[0.6, 0.3, 0.1]] * 2
 
 
+@pytest.mark.slow
 def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     """Of a discrepancy that is more than chance, and of an effect that the data do not show."""
     data, setup, result = identified

@@ -131,6 +131,7 @@ def test_innovations_are_white_with_the_predicted_covariance(pair):
     assert np.sum(worse[1:] * worse[:-1]) > 0.05 * np.sum(worse**2)
 
 
+@pytest.mark.slow
 def test_extended_filter_is_the_kalman_predictor_on_a_linear_arm(twomass):
     structure, par = twomass
     _, space = linear(structure, par)

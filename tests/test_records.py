@@ -106,6 +106,7 @@ def moves_with_dwells(size, scale=1.0, asymmetry=0.0):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_friction_at_rest_is_what_the_drive_asks_of_it():
     size = 0.8
     data = moves_with_dwells(size)

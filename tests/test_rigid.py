@@ -283,6 +283,7 @@ def test_a_long_search_leaves_time_for_one_beside_inertias_found(moved, monkeypa
     assert ends == [pytest.approx(500.0, abs=20.0), pytest.approx(1000.0, abs=1.0)]
 
 
+@pytest.mark.slow
 def test_a_payload_in_motions_alone_is_still_named(ur10, tmp_path):
     """Freed inertias would hide it: they are asked only where the catalogue leaves much.
 

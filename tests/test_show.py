@@ -294,6 +294,7 @@ def test_figures_leave_the_callers_matplotlib_alone():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_failing_run_harms_no_earlier_output(diagnosis, tmp_path, monkeypatch):
     write_outputs(diagnosis, tmp_path / "out")
     before = {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir()}
