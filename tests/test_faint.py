@@ -40,10 +40,11 @@ def hypotheses(identified):
 
 @pytest.mark.parametrize(("faint", "beside"), [
     (COGGING, ()),
-    pytest.param(COULOMB, (DELAY,), marks=pytest.mark.slow),
-    pytest.param(COULOMB, (), marks=pytest.mark.slow),
-    pytest.param(COGGING, (DELAY,), marks=pytest.mark.slow),
+    (COULOMB, (DELAY,)),
+    (COULOMB, ()),
+    (COGGING, (DELAY,)),
 ])  # fmt: skip
+@pytest.mark.slow
 def test_an_effect_within_the_error_of_the_noise_is_found(ur10, tmp_path, faint, beside):
     """Alone, and beside another one that is not faint."""
     effects = [parse_effect(text, ur10) for text in (*beside, faint)]
