@@ -36,7 +36,7 @@ from ident.hypotheses.bodies import LOAD_NATS, link_inertia, payload, payload_li
 from ident.hypotheses.drive import torque_saturation
 from ident.hypotheses.hinges import hinge_inertia
 from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
-from ident.hypotheses.sensing import encoder_eccentricity, position_scale, torque_offset
+from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import apply_change
 from ident.identification import identify
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, plane_at, solve, stalled
@@ -1059,8 +1059,11 @@ def test_a_position_recorded_too_large_is_no_encoder_out_of_centre(clean):
     wrong = tuple(replace(s, q=s.q * np.where(np.arange(len(data.joints)) == j, 1.03, 1.0)) for s in data.segments)
     setup, first = identify(replace(data, segments=wrong))
     problem = setup.problem
-    laws = (position_scale(j, "elbow_joint"), [1.01]), (encoder_eccentricity(j, "elbow_joint"), [0.01, 0.01])
-    models = (replace(first.model, effects=(Effect(h, np.array(start)),)) for h, start in laws)
+    at_joint = {h.key: h for h in reversed(catalogue(problem.structure)) if h.place == "elbow_joint"}
+    laws = ("unknown:position_scale", [1.01]), ("encoder_eccentricity", [0.01, 0.01])  # of a turn of the joint
+    models = (
+        replace(first.model, effects=(Effect(at_joint[name, "elbow_joint"], np.array(start)),)) for name, start in laws
+    )
     scaled, turned = (fit(problem, model, remainders=first.remainders) for model in models)
     assert scaled.model.effects[0].p[0] == pytest.approx(1.03, rel=1e-3)
     assert scaled.chi2_per_dof < 1.2 and turned.chi2_per_dof > 5.0
