@@ -124,7 +124,7 @@ def diagnose_fully(
 
     gain, shown, pairs = tested(result)
     notes: list[str] = []
-    if harmful(gain):
+    if gain is not None and gain.worse:
         names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
         notes.append(
             f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
@@ -220,11 +220,6 @@ def tones_of(recorded: Sequence[Group], found: Sequence[Prediction]) -> tuple[To
         return find_tones(recorded, [p.sampled_impedance for p in found])
     except (np.linalg.LinAlgError, ArithmeticError):
         return ()
-
-
-def harmful(gain: Gain | None) -> bool:
-    """Whether held-out data are predicted worse with the causes than without, beyond chance."""
-    return gain is not None and gain.ci95 is not None and gain.ci95[1] < 0.0
 
 
 def withdrawn(verdict: Verdict, doubts: Sequence[str]) -> Verdict:

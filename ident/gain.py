@@ -117,8 +117,8 @@ def measure_gain(
 
     The interval is a percentile bootstrap over segments, over stretches of motions, or over the lines of a single
     periodic record: what other phases of the same excitation would show in that posture, and nothing of other postures.
-    It is as wide as errors of one size at all lines ask for, and wider than needed where few of them hold most. None
-    where no segment could be predicted.
+    It is as wide as errors of one size at all lines ask for, and wider than needed where few of them hold most; None
+    where so many resamples have no gap that it has no end. The gain is None where no segment could be predicted.
 
     Args:
         joints: unit of the torque of each.
@@ -143,15 +143,27 @@ def measure_gain(
     before, after, noise = rms(errors.before), rms(errors.after), rms(errors.noise)
     gap = before - noise
     closed = (before - after) / gap if gap > 0.02 * noise else None
-    interval = None
+    interval, worse = None, False
     if closed is not None and len(errors.segments) > 1:
         pick = rng.integers(len(errors.segments), size=(RESAMPLES, len(errors.segments)))
         b, a, f = (np.sqrt(x[pick].mean(axis=1) / n) for x in (errors.before, errors.after, errors.noise))
-        ratio = (b - a) / np.maximum(b - f, 1e-300)
-        interval = tuple(float(v) for v in np.quantile(ratio, [0.025, 0.975]))
+        interval = _interval_of_ratio(b - a, b - f)
+        worse = bool(np.mean(a > b) > 0.975)
     told, of = tuple(dict.fromkeys(errors.segments)), tuple(list(joints)[j] for j in pick_joints)
     unit = common_unit(joints[name] for name in of)
-    return Gain(told, f"{metric}, {unit}", before, after, noise, closed, interval, method, of, by_joint)
+    return Gain(told, f"{metric}, {unit}", before, after, noise, closed, interval, method, of, by_joint, worse)
+
+
+def _interval_of_ratio(gained: np.ndarray, gap: np.ndarray) -> tuple[float, float] | None:
+    """95 % interval of what is gained over the gap, of resamples; None where it has no end.
+
+    A resample without a gap says nothing of its share that is closed: it counts at either end.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = gained / gap
+    ends = [np.where(gap > 0.0, ratio, worst) for worst in (-np.inf, np.inf)]
+    low, high = (float(np.quantile(x, q, method="inverted_cdf")) for x, q in zip(ends, (0.025, 0.975), strict=True))
+    return (low, high) if np.isfinite([low, high]).all() else None
 
 
 def ratio_interval(errors: Errors, rng: np.random.Generator, level: float) -> tuple[float, float]:

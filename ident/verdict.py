@@ -91,7 +91,8 @@ class JointGain:
 class Gain:
     """Prediction error on held-out segments before and after, in the unit that ``metric`` ends with.
 
-    ``joints``: those over which errors are taken; ``by_joint``: all, one by one.
+    ``joints``: those over which errors are taken; ``by_joint``: all, one by one; ``worse``: whether held-out data are
+    predicted worse, beyond chance.
     """
 
     segments: tuple[str, ...]
@@ -104,6 +105,7 @@ class Gain:
     method: str
     joints: tuple[str, ...] = ()
     by_joint: dict[str, JointGain] = field(default_factory=dict)
+    worse: bool = False
 
     @property
     def over_all(self) -> tuple[float, float]:

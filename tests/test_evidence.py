@@ -16,7 +16,7 @@ from ident.contests import alike, best_of_each, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
-from ident.diagnosis import diagnose, harmful, left_over
+from ident.diagnosis import diagnose, left_over
 from ident.evidence import (
     ABSENT,
     LAW_ERROR,
@@ -782,14 +782,6 @@ def test_a_gear_far_from_its_guess_has_gone_astray(identified):
     far = replace(par, damping=par.damping * np.array([1, 1, 1, 100, 1, 1]))
     moved = replace(fit, model=replace(fit.model, par=far))
     assert list(np.flatnonzero(astray(setup.problem, moved))) == [3]
-
-
-@pytest.mark.parametrize(
-    "interval, bad", [((-2.0, -0.1), True), ((-1.0, 0.3), False), ((0.8, 1.0), False), (None, False)]
-)
-def test_an_extension_that_surely_harms_is_taken_back(interval, bad):
-    assert harmful(Gain(("a", "b"), "rms", 1.0, 1.5, 0.1, -0.5, interval, "validation segments")) == bad
-    assert not harmful(None)
 
 
 @pytest.mark.parametrize(

@@ -72,3 +72,28 @@ def test_the_interval_of_a_single_periodic_record_covers_what_other_phases_show(
 def test_lines_of_a_record_make_up_its_mean_square():
     lines = np.random.default_rng(0).random((30, 2))
     assert line_squares(lines).mean(axis=0) == pytest.approx(mean_squares(lines[None])[0])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "worse"),
+    [
+        ((1.0, 1.1, 1.2), (1.5, 1.7, 1.6), True),
+        ((1.0, 1.1, 1.2), (0.5, 1.7, 1.0), False),
+        ((1.0, 1.1, 1.2), (0.1,) * 3, False),
+    ],
+)
+def test_what_surely_harms_is_told(before, after, worse):
+    rows = [np.square(x)[:, None] for x in (before, after, (0.1,) * 3)]
+    gain = measure_gain(Errors(("a", "b", "c"), *rows), {"drive": "N m"}, [0], "method", np.random.default_rng(0))
+    assert gain.worse == worse
+
+
+def test_a_gap_within_the_noise_of_some_records_has_no_interval():
+    """Of three records two lie below the noise; a quarter of the resamples has no gap."""
+    rows = [np.array(x)[:, None] for x in ((9.0, 0.9, 0.9), (1.0, 0.5, 0.5), (1.0, 1.0, 1.0))]
+    told = measure_gain(Errors(("a", "b", "c"), *rows), {"drive": "N m"}, [0], "method", np.random.default_rng(0))
+    assert told.gap_closed is not None and told.ci95 is None and not told.worse
+    rows[0][1:] = 4.0
+    told = measure_gain(Errors(("a", "b", "c"), *rows), {"drive": "N m"}, [0], "method", np.random.default_rng(0))
+    low, high = told.ci95
+    assert 0.9 < low <= told.gap_closed <= high < 1.5
