@@ -351,7 +351,9 @@ def _put_inertia(body: mujoco.MjsBody, mass: float, com: np.ndarray, tensor: np.
     body.mass = max(mass, 1e-9)
     body.ipos = com
     body.iquat = _quat(Rotation.from_matrix(axes))
-    body.inertia = np.maximum(values, 1e-12)
+    least, middle, most = np.maximum(values, 1e-12)
+    # Rounding makes more than a body can have of a flat one.
+    body.inertia = [least, middle, min(most, (1.0 - 1e-12) * (least + middle))]
 
 
 def _add_mass(body: mujoco.MjsBody, name: str, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:

@@ -32,6 +32,7 @@ from ident.verdict import (
     Verdict,
 )
 from robot_assets.robot import Elasticity, load_robot
+from sim.plant import build_plant
 
 
 def cause(effect, joint, **values):
@@ -59,6 +60,31 @@ def test_the_exported_arm_has_the_inertia_and_gravity_of_the_model(ur10):
     assert np.allclose(data.qfrc_bias[link], lin.g, rtol=1e-6, atol=1e-6)
     assert np.allclose(data.qfrc_passive[link], ur10.array("stiffness") * delta, rtol=1e-9)
     assert np.allclose(np.diag(M)[motor], ur10.array("motor_inertia"), rtol=1e-6)
+
+
+def test_flat_links_are_exported_and_simulated(tmp_path):
+    """The largest moment of inertia of a flat body is the sum of the others, which rounding passes."""
+    irb, rng = load_robot("irb"), np.random.default_rng(0)
+
+    def flat(_):
+        R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        I = R @ np.diag([0.7, 1.1, 1.8]) @ R.T
+        return (
+            f'<inertia ixx="{float(I[0, 0])!r}" ixy="{float(I[0, 1])!r}" ixz="{float(I[0, 2])!r}"'
+            f' iyy="{float(I[1, 1])!r}" iyz="{float(I[1, 2])!r}" izz="{float(I[2, 2])!r}"/>'
+        )
+
+    for file in irb.folder.iterdir():
+        if file.is_file():
+            (tmp_path / file.name).write_text(re.sub("<inertia .*/>", flat, file.read_text()))
+    robot = load_robot(tmp_path)
+    spec = build_mjcf(robot, parameters(robot))
+    spec.compile()
+    again = mujoco.MjModel.from_xml_string(spec.to_xml())
+    moments = np.sort([again.body(i).inertia for i in range(again.nbody) if again.body(i).inertia.max() > 1.0])
+    assert len(moments) == robot.n
+    assert np.allclose(moments[:-1], [0.7, 1.1, 1.8], rtol=2e-5)  # the last bears what is fixed to it
+    assert build_plant(robot).model.nv > robot.n
 
 
 HINGES = [

@@ -28,6 +28,7 @@ MOST_ROUNDED = 2.0  # exponent of a presliding friction below which it is the br
 FRICTION_SLIP = "friction"  # begins the names of springs that stand for the friction of a motor
 PASSIVE_GROUP = 1  # of actuators without input
 TORQUE_OFFSET = "torque_offset"
+FLAT = 1e-5  # of the largest moment of inertia, by which the others are more together
 ROTOR_MASS = 1e-3  # kg, of a sphere of 50 mm: a body must have a mass; its inertia is taken off the armature
 ROTOR_BODY = 0.4 * ROTOR_MASS * 0.05**2
 
@@ -149,6 +150,16 @@ def _link_change(cause: Cause) -> LinkChange:
     return LinkChange(p["mass"], (p["com_x"], p["com_y"], p["com_z"]), p["inertia"], cause.with_load)
 
 
+def _of_a_body(moments: np.ndarray) -> np.ndarray:
+    """The nearest principal moments of inertia, ascending (3,) kg m2, that a body can have: the largest is no more than
+    the sum of the others, with a margin for the digits of the file.
+
+    A flat body has that sum itself, and rounding passes it; MuJoCo takes no such body.
+    """
+    beyond = (1.0 + FLAT) * moments[2] - moments[:2].sum()
+    return moments + max(beyond, 0.0) / 3.0 * np.array([1.0, 1.0, -1.0])
+
+
 def _add_bodies(spec: mujoco.MjSpec, model: pin.Model, springs: dict[str, Elasticity]) -> None:
     bodies = {0: spec.worldbody}
     for i in range(1, model.njoints):
@@ -161,7 +172,7 @@ def _add_bodies(spec: mujoco.MjSpec, model: pin.Model, springs: dict[str, Elasti
         values, axes = np.linalg.eigh(inertia.inertia)
         axes[:, 0] *= np.sign(np.linalg.det(axes))
         x, y, z, w = pin.Quaternion(axes).coeffs()
-        body.iquat, body.inertia = [w, x, y, z], np.maximum(values, 1e-12)
+        body.iquat, body.inertia = [w, x, y, z], _of_a_body(np.maximum(values, 1e-12))
         slide = "Prismatic" in model.joints[i].shortname()
         joint = body.add_joint(
             name=name if name in springs else f"link:{name}",
