@@ -62,28 +62,32 @@ def test_the_exported_arm_has_the_inertia_and_gravity_of_the_model(ur10):
     assert np.allclose(np.diag(M)[motor], ur10.array("motor_inertia"), rtol=1e-6)
 
 
-def test_flat_links_are_exported_and_simulated(tmp_path):
-    """The largest moment of inertia of a flat body is the sum of the others, which rounding passes."""
-    irb, rng = load_robot("irb"), np.random.default_rng(0)
+def with_moments(folder, moments):
+    """The irb in another folder, each link with these principal moments of inertia about axes drawn at random."""
+    rng = np.random.default_rng(0)
 
-    def flat(_):
+    def inertia(_):
         R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        I = R @ np.diag([0.7, 1.1, 1.8]) @ R.T
-        return (
-            f'<inertia ixx="{float(I[0, 0])!r}" ixy="{float(I[0, 1])!r}" ixz="{float(I[0, 2])!r}"'
-            f' iyy="{float(I[1, 1])!r}" iyz="{float(I[1, 2])!r}" izz="{float(I[2, 2])!r}"/>'
-        )
+        I = (R @ np.diag(moments) @ R.T).tolist()
+        return f'<inertia ixx="{I[0][0]}" ixy="{I[0][1]}" ixz="{I[0][2]}" iyy="{I[1][1]}" iyz="{I[1][2]}" izz="{I[2][2]}"/>'
 
-    for file in irb.folder.iterdir():
+    for file in load_robot("irb").folder.iterdir():
         if file.is_file():
-            (tmp_path / file.name).write_text(re.sub("<inertia .*/>", flat, file.read_text()))
-    robot = load_robot(tmp_path)
+            (folder / file.name).write_text(re.sub("<inertia .*/>", inertia, file.read_text()))
+    return load_robot(folder)
+
+
+@pytest.mark.parametrize("largest", [1.8, 1.82])
+def test_flat_links_are_exported_and_simulated(tmp_path, largest):
+    """The largest moment of inertia of a flat body is the sum of the others, which the digits of a file pass."""
+    robot = with_moments(tmp_path, [0.7, 1.1, largest])
     spec = build_mjcf(robot, parameters(robot))
     spec.compile()
     again = mujoco.MjModel.from_xml_string(spec.to_xml())
     moments = np.sort([again.body(i).inertia for i in range(again.nbody) if again.body(i).inertia.max() > 1.0])
     assert len(moments) == robot.n
-    assert np.allclose(moments[:-1], [0.7, 1.1, 1.8], rtol=2e-5)  # the last bears what is fixed to it
+    expected = np.array([0.7, 1.1, largest]) + (largest - 1.8) / 3.0 * np.array([1.0, 1.0, -1.0])
+    assert np.allclose(moments[:-1], expected, rtol=2e-5)  # the last bears what is fixed to it
     assert build_plant(robot).model.nv > robot.n
 
 
