@@ -13,7 +13,7 @@ from ident.coordinates import coordinate_names, effect_steps, moves_geometry, mo
 from ident.errors_in_variables import impedance_slopes, scatter_information, scatter_slope
 from ident.extended import Prediction, predict, predict_at, through_drives
 from ident.group import Group
-from ident.inverse import baseline_products
+from ident.inverse import Plane, baseline_products
 from ident.model import Effect, Model, joints_along_record
 from ident.motion import Motion
 from ident.parallel import map_threads
@@ -45,7 +45,7 @@ def jacobian(
     if exact or sway or any(moves_geometry(e, motion) for e in model.effects):
         remade = _again(problem, model, group, pred, 1)
     posture = moved_by_posture(pred)[:, :top] if shifts and not exact and not motion else None
-    n, base = model.structure.n, _baseline(model, pred, top)
+    n, base = model.structure.n, _baseline(model, pred, pred.plane, top)
     late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
     late[..., :n] = pred.plane.s[:top, None] * pred.solution.U[:, :top]
     baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
@@ -72,12 +72,13 @@ def jacobian(
     return columns.made_whole(dense)
 
 
-def _baseline(model: Model, pred: Prediction, top: int) -> Products:
-    """Derivatives by the log-parameters of the model, without those of hinges that its effects add."""
+def _baseline(model: Model, pred: Prediction, plane: Plane, top: int) -> Products:
+    """Derivatives by the log-parameters of the model, without those of hinges that its effects add, of a linear
+    arm."""
     n, n_e = model.structure.n, len(model.structure.elastic)
     extra = len(pred.structure.elastic) - n_e
     keep = np.r_[: 4 * n + n_e, 4 * n + n_e + extra : 4 * n + extra + 2 * n_e]
-    return baseline_products(pred.structure, pred.par, pred.plane, pred.solution, top).pick(keep)
+    return baseline_products(pred.structure, pred.par, plane, pred.solution, top).pick(keep)
 
 
 def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps: int) -> Prediction:
@@ -307,7 +308,7 @@ def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], we
     def of_group(of: tuple[Group, Prediction, np.ndarray]) -> np.ndarray:
         group, pred, whiten = of
         K = len(whiten)
-        return scatter_slope(group, pred, whiten, _baseline(model, pred, K), others(group, pred, K), count)
+        return scatter_slope(group, pred, whiten, _baseline(model, pred, pred.about, K), others(group, pred, K), count)
 
     return sum(map_threads(of_group, zip(problem.groups, preds, weights.whiten, strict=True)))
 
@@ -315,7 +316,10 @@ def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], we
 def shared_information(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
     """What noise adds to the normal matrix of the baseline parameters."""
     each = zip(problem.groups, preds, weights.whiten, strict=True)
-    return sum(scatter_information(g, pred, whiten, _baseline(model, pred, len(whiten))) for g, pred, whiten in each)
+    return sum(
+        scatter_information(g, pred, whiten, _baseline(model, pred, pred.about, len(whiten)))
+        for g, pred, whiten in each
+    )
 
 
 def as_real(X: np.ndarray) -> np.ndarray:

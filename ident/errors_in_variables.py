@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.columns import Products
-from ident.extended import Prediction
+from ident.extended import Prediction, moves_plane, predict_at
 from ident.group import Group
 from ident.inverse import Sampling, make_plane
 from ident.model import Effect, Model
@@ -122,7 +122,7 @@ def _scaled(information: np.ndarray, by_noise: np.ndarray) -> tuple[np.ndarray, 
 def signals_per_position(pred: Prediction, count: int) -> np.ndarray:
     """(count, m, n) signals of ``baseline_products`` per motor position: deflections, positions, elastic
     coordinates."""
-    plane, par, structure = pred.plane, pred.par, pred.structure
+    plane, par, structure = pred.about, pred.par, pred.structure
     links = (plane.A_inv[:count][:, :, structure.driven] * plane.C[:count, None]) @ par.coupling
     deflections = par.coupling - links[:, structure.driven]
     n = par.coupling.shape[1]
@@ -151,16 +151,21 @@ def impedance_slopes(
         effect: its number in the model; steps: parameters after a step of each coordinate, and the step.
     """
     h, K = model.effects[effect].hypothesis, group.n_compared
-    if h.channel != "model" and "filter" not in h.options:
+    if h.channel != "model" and "filter" not in h.options and not moves_plane(h):
         return
+    held = {"W": pred.solution.W, "torques": pred.solution.torques}
+    elsewhere = pred.about is not pred.plane and (h.channel == "model" or moves_plane(h))
     for p, step in steps:
         effects = tuple(Effect(h, p) if i == effect else e for i, e in enumerate(model.effects))
         there = Model(model.structure, model.par, effects)
-        structure, par, plane = pred.structure, pred.par, pred.plane
+        structure, par, plane, about = pred.structure, pred.par, pred.plane, pred.about
         if h.channel == "model":
             structure, par = there.built()
-            plane = make_plane(structure, par, group, sampling)
-        moved = replace(pred, model=there, structure=structure, par=par, plane=plane)
+            plane = about = make_plane(structure, par, group, sampling)
+        if elsewhere:
+            moved = predict_at(there, structure, par, plane, group, sampling, **held)
+        else:
+            moved = replace(pred, model=there, structure=structure, par=par, plane=plane, about=about)
         yield (moved.sampled_impedance[:K] - pred.sampled_impedance[:K]) / step
 
 

@@ -9,10 +9,11 @@ from functools import cached_property, partial
 import numpy as np
 
 from ident.chain import Structure
-from ident.graybox import Parameters, impedance
+from ident.graybox import Parameters, impedance, linearise
 from ident.group import Group
 from ident.hypotheses import kernels
-from ident.inverse import REMAINDER_STEPS, Plane, Sampling, make_plane, solve, true_position
+from ident.hypotheses.hypothesis import Hypothesis
+from ident.inverse import REMAINDER_STEPS, Plane, Sampling, make_plane, plane_at, solve, true_position
 from ident.model import Effect, Model, has_loop, is_along_record, is_dry, joints_along_record
 from ident.motion import Motion, Solution, Torques
 from ident.reactions import inner_torques, motor_torques
@@ -24,7 +25,12 @@ REACTION_STEPS = 8  # passes at most until torques and the motion that they caus
 class Prediction:
     """What a model predicts for a group, and what it was computed with.
 
-    ``added_stiffness`` (n,): of effects in parallel with the gears, about the motion, N m/rad.
+    Attributes:
+        plane: the linear arm that it was computed with.
+        about: that for small changes about the motion: in the posture that it has, where an encoder that is out of
+            centre tells another one, and with springs to the links.
+        added_stiffness: (n,) of effects in parallel with the gears, about the motion, N m/rad.
+        position_slopes: (n,) true position per measured one of encoders that err with it, about the motion.
     """
 
     model: Model
@@ -32,9 +38,11 @@ class Prediction:
     structure: Structure
     par: Parameters
     plane: Plane
+    about: Plane
     solution: Solution
     U: np.ndarray
     added_stiffness: np.ndarray
+    position_slopes: np.ndarray
 
     def motion(self, group: Group) -> Motion:
         """The predicted motion in time, with the torque that its drives deliver."""
@@ -52,13 +60,13 @@ class Prediction:
     def sampled_impedance(self) -> np.ndarray:
         """(L, n, n) recorded torque per motor position for small changes about the motion.
 
-        What noise on the position becomes in the torque residual. Gears count with their
+        What noise on the position becomes in the torque residual. Gears and encoders count with their
         mean slope: a hardening gear passes on more noise than a linear one. With filters of drives and sensors.
         """
-        Z = self.plane.Z
+        Z = self.about.Z
         if np.any(self.added_stiffness):
             stiffness = np.maximum(self.par.stiffness + self.added_stiffness, 0.05 * self.par.stiffness)
-            Z = impedance(self.structure, replace(self.par, stiffness=stiffness), self.plane.lin, self.plane.s)[0]
+            Z = impedance(self.structure, replace(self.par, stiffness=stiffness), self.about.lin, self.about.s)[0]
         Z = self.plane.record[:, None, None] * Z
         recorded, true = self.filters
         return recorded[:, :, None] * Z * true[:, None, :]
@@ -67,7 +75,8 @@ class Prediction:
     def filters(self) -> tuple[np.ndarray, np.ndarray]:
         """What linear drives record per torque that they deliver, and the true position per measured one; (L, n)
         each."""
-        return linear_filters(self.model, self.plane.s)
+        recorded, true = linear_filters(self.model, self.plane.s)
+        return recorded, true * self.position_slopes
 
 
 def linear_filters(model: Model, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -163,9 +172,12 @@ def predict_at(
         motion = Motion(group, solution, par, delivered=given, told=along)
         at_motors = plane.record[:, None] * motor_torques(par, motion, motor)
         solution = replace(solution, U=solution.U + at_motors)
-    U = through_drives(drives, Motion(group, solution, par))
-    added = _added_stiffness(par, Motion(group, solution, par), by_channel.get("spring", []))
-    return Prediction(model, sampling, structure, par, plane, solution, U, added)
+    motion = Motion(group, solution, par)
+    U = through_drives(drives, motion)
+    added = _added_stiffness(par, motion, by_channel.get("spring", []))
+    about = _about_motion(model, structure, par, plane, group, solution)
+    slopes = _position_slopes(motion, by_channel.get("position", []))
+    return Prediction(model, sampling, structure, par, plane, about, solution, U, added, slopes)
 
 
 def through_drives(effects: Sequence[Effect], motion: Motion) -> np.ndarray:
@@ -205,4 +217,34 @@ def _added_stiffness(par: Parameters, motion: Motion, effects: Sequence[Effect])
             j = effect.hypothesis.joint
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
             out[j] += np.mean(kernels.mean_slope(law, motion.delta(j)))
+    return out
+
+
+def _about_motion(
+    model: Model, structure: Structure, par: Parameters, plane: Plane, group: Group, solution: Solution
+) -> Plane:
+    """The linear arm for small changes about a motion: in its mean posture, with springs to the links."""
+    effects = [e for e in model.effects if moves_plane(e.hypothesis)]
+    if not effects:
+        return plane
+    lin = linearise(structure, solution.Q_a[:, 0].real.mean(axis=0))
+    for h, p in ((e.hypothesis, e.p) for e in effects):
+        if "link_stiffness" in h.options:
+            lin.Kg[structure.driven[h.joint], structure.driven[h.joint]] += h.options["link_stiffness"](p)
+    return plane_at(structure, par, lin, group, plane.record)
+
+
+def moves_plane(hypothesis: Hypothesis) -> bool:
+    """Whether small changes about the motion are those of another linear arm than the one that predictions are computed
+    with."""
+    return hypothesis.channel == "position" or "link_stiffness" in hypothesis.options
+
+
+def _position_slopes(motion: Motion, effects: Sequence[Effect]) -> np.ndarray:
+    """(n,) mean slope of the true position by the measured one, of encoders whose error is a law of the position."""
+    out = np.ones(len(motion.par.stiffness))
+    for effect in effects:
+        if "slope" in effect.hypothesis.options:
+            j = effect.hypothesis.joint
+            out[j] *= np.mean(effect.hypothesis.options["slope"](effect.p, motion.q(j)))
     return out

@@ -60,7 +60,7 @@ def output_covariance(
     if group.rounding is not None:
         position = position + group.rounding[:, None]
     recorded, true = prediction.filters
-    per_position = prediction.plane.output_per_position[: len(S)] * true[: len(S), None]
+    per_position = prediction.about.output_per_position[: len(S)] * true[: len(S), None]
     per_position[:, :n] *= recorded[: len(S), :, None]
     of_links = np.concatenate([np.zeros(n), group.link_std[links] ** 2 / samples])
     all_of_it = white_covariance(per_position, of_links, position)

@@ -39,7 +39,10 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
         "A spring of {stiffness:.3g} N m/rad with rest at {rest_angle:.3g} rad pulls on the link of {joint}: static"
         " torque that is linear in posture.",
         variable="q",
-        options={"trivial": lambda p, k: abs(p[1]) > 0.95 * FARTHEST_REST},  # a constant torque
+        options={
+            "trivial": lambda p, k: abs(p[1]) > 0.95 * FARTHEST_REST,  # a constant torque
+            "link_stiffness": lambda p: p[0],
+        },
     )
 
 

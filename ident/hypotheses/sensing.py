@@ -77,6 +77,9 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
             error = p[0] * np.sin(q) + p[1] * np.cos(q)
         return -motion.lines(error)
 
+    def slope(p, q: np.ndarray) -> np.ndarray:
+        return 1.0 / (1.0 + turns * (p[0] * np.cos(turns * q) - p[1] * np.sin(turns * q)))
+
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q = turns * motion.q(j)
         return Screen((-motion.lines(np.sin(q)), -motion.lines(np.cos(q))), lambda c: np.array(c))
@@ -96,6 +99,7 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         "The encoder of {joint} errs by {amplitude:.3g} rad once a turn of "
         + ("its motor." if turns != 1.0 else "the joint."),
         variable="q",
+        options={"slope": slope},
     )
 
 
