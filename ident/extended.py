@@ -175,7 +175,7 @@ def predict_at(
     motion = Motion(group, solution, par)
     U = through_drives(drives, motion)
     added = _added_stiffness(par, motion, by_channel.get("spring", []))
-    about = _about_motion(model, structure, par, plane, group, solution)
+    about = _about_motion(model, motion, structure, plane)
     slopes = _position_slopes(motion, by_channel.get("position", []))
     return Prediction(model, sampling, structure, par, plane, about, solution, U, added, slopes)
 
@@ -220,24 +220,24 @@ def _added_stiffness(par: Parameters, motion: Motion, effects: Sequence[Effect])
     return out
 
 
-def _about_motion(
-    model: Model, structure: Structure, par: Parameters, plane: Plane, group: Group, solution: Solution
-) -> Plane:
-    """The linear arm for small changes about a motion: in its mean posture, with springs to the links."""
+def _about_motion(model: Model, motion: Motion, structure: Structure, plane: Plane) -> Plane:
+    """The linear arm for small changes about a motion: in its mean posture, with the mean slopes of laws at the
+    links."""
     effects = [e for e in model.effects if moves_plane(e.hypothesis)]
     if not effects:
         return plane
-    lin = linearise(structure, solution.Q_a[:, 0].real.mean(axis=0))
-    for h, p in ((e.hypothesis, e.p) for e in effects):
-        if "link_stiffness" in h.options:
-            lin.Kg[structure.driven[h.joint], structure.driven[h.joint]] += h.options["link_stiffness"](p)
-    return plane_at(structure, par, lin, group, plane.record)
+    lin = linearise(structure, motion.solution.Q_a[:, 0].real.mean(axis=0))
+    for h, p in ((e.hypothesis, e.p) for e in effects if e.hypothesis.channel == "link"):
+        loop = h.options.get("loop")
+        slope = np.mean(kernels.mean_slope(loop(p), motion.q_link(h.joint))) if loop else h.options["slope"](p)
+        lin.Kg[structure.driven[h.joint], structure.driven[h.joint]] += slope
+    return plane_at(structure, motion.par, lin, motion.group, plane.record)
 
 
 def moves_plane(hypothesis: Hypothesis) -> bool:
     """Whether small changes about the motion are those of another linear arm than the one that predictions are computed
     with."""
-    return hypothesis.channel == "position" or "link_stiffness" in hypothesis.options
+    return hypothesis.channel in ("position", "link")
 
 
 def _position_slopes(motion: Motion, effects: Sequence[Effect]) -> np.ndarray:

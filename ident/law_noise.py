@@ -66,8 +66,7 @@ def loop_noise(pred: Prediction, group: Group) -> np.ndarray | None:
         at = _place_of(here, pred, pred.solution)
         x = group.to_time(at.motion[..., None])[..., 0]
         slopes = sum(kernels.mean_slope(law, x) for law in at.laws)
-        # The impedance of the linear arm holds that of gears alone.
-        slope, softened = slopes.mean() if place[1] == "spring" else 0.0, np.ones_like(at.compliance)
+        slope, softened = slopes.mean(), np.ones_like(at.compliance)
         softened[1:] = 1.0 / (1.0 + at.compliance[1:] * slope)  # the mean has no noise
         free = at.motion + at.compliance * at.torque
         share = signal_share(free, noise_of_motion(group, at.per_position))

@@ -41,7 +41,7 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
         variable="q",
         options={
             "trivial": lambda p, k: abs(p[1]) > 0.95 * FARTHEST_REST,  # a constant torque
-            "link_stiffness": lambda p: p[0],
+            "slope": lambda p: p[0],
         },
     )
 
