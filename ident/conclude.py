@@ -427,12 +427,13 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
         return f"The simulation misses something that these data do not tell for sure: {possible}."
     if not sure:
         return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
-    names = " and ".join(_said(c.effect, c.joint, c.probability) for c in sure)
+    *others, last = [_said(c.effect, c.joint, c.probability) for c in sure]
+    names = f"{', '.join(others)} and {last}" if others else last
     of_torque = any(c.channel != "q_link" and c.effect != "encoder_quantization" for c in sure)
     closed = (
         ""
         if gain is None or gain.gap_closed is None or not of_torque
-        else f"; naming it closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
+        else f"; naming {'them' if others else 'it'} closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
     )
     rest = ", and an unknown cause remains" if unknown else f"; not for sure {possible}" if possible else ""
     return f"The simulation misses {names}{closed}{rest}."

@@ -686,6 +686,25 @@ def test_the_sentence_tells_what_is_sure_what_is_not_and_what_nothing_explains(c
     assert sentence(found, unknown, True, None) == told
 
 
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (["cogging"], "cogging at a (99%); naming it closes"),
+        (["cogging", "backlash"], "cogging at a (99%) and backlash at a (99%); naming them closes"),
+        (
+            ["cogging", "backlash", "payload"],
+            "cogging at a (99%), backlash at a (99%) and payload at a (99%); naming them closes",
+        ),
+    ],
+)
+def test_the_sentence_lists_several_causes(names, told):
+    from ident.conclude import sentence
+    from ident.verdict import Cause
+
+    said = sentence([Cause(e, "a", {}, 0.99, "", ()) for e in names], False, True, SimpleNamespace(gap_closed=0.9))
+    assert said == f"The simulation misses {told} 90.0% of the gap to the noise on held-out data."
+
+
 def test_drives_that_stand_for_what_is_missing_are_noticed(identified):
     from ident.trust import collapsed
 
