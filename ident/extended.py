@@ -237,7 +237,8 @@ def _about_motion(model: Model, motion: Motion, structure: Structure, plane: Pla
 def moves_plane(hypothesis: Hypothesis) -> bool:
     """Whether small changes about the motion are those of another linear arm than the one that predictions are computed
     with."""
-    return hypothesis.channel in ("position", "link")
+    h = hypothesis
+    return h.channel == "position" or (h.channel == "link" and ("loop" in h.options or "slope" in h.options))
 
 
 def _position_slopes(motion: Motion, effects: Sequence[Effect]) -> np.ndarray:

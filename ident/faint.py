@@ -7,7 +7,8 @@ lines no more than a tenth more of that (score test, Rao 1948; theory.md 9.3).
 
 Where the scatter between periods does not say how the noise is spread over the lines, what noise alone explains is told
 by what is left itself with its phases drawn anew, all joints of a line together: of the same spectrum and correlation,
-and no response.
+and no response. Where it does, what the periods differ by tells whether the noise of lines and joints goes together, as
+that of a clock that wanders does: then a few numbers explain much of it too, and nothing is told.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ ROUGH = 10.0
 # records may be in another steady motion than the model
 # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
 LINEAR = 0.3
-PHASES = 4  # draws of phases
-BY_PHASES = 2.5  # factor on what the best of all hypotheses explains of those, from which a faint cause is sought
+DRAWS = 4  # of what noise may have left
+BY_PHASES = (
+    2.5  # factor on what the best of all hypotheses explains of other phases, from which a faint cause is sought
+)
 # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 SHADOW = 1e-3
 
@@ -54,9 +57,10 @@ def hidden(
     """
     scores = faint_scores(problem, current, hypotheses, told)
     clear = seen(scores, current)
-    if clear is None or (
-        not scatter_is_seen(problem) and clear.gain < BY_PHASES * by_phases(problem, current, hypotheses)
-    ):
+    if clear is None:
+        return (), 1.0
+    explained = by_noise_alone(problem, current, hypotheses)
+    if explained > (SEEN if scatter_is_seen(problem) else clear.gain / BY_PHASES):
         return (), 1.0
     chance = min(1.0, len(scores) * scipy.stats.chi2.sf(clear.gain, clear.dof))
     return tuple(s.hypothesis for s in scores if s.gain >= LINEAR * clear.gain), float(chance)
@@ -90,23 +94,34 @@ def scatter_is_seen(problem: Problem) -> bool:
     return all(g.U_periods.shape[1] > 1 for g in problem.groups)
 
 
-def by_phases(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> float:
-    """What the best of all hypotheses explains of what a model leaves, with phases drawn anew: the most in a few
-    draws."""
+def by_noise_alone(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> float:
+    """What the best of all hypotheses explains of noise like that of the records: the most in a few draws."""
     preds = predictions(problem, current.model, current.remainders)
-    rng = np.random.default_rng(PHASES)
+    draw, rng = with_other_scatter if scatter_is_seen(problem) else with_other_phases, np.random.default_rng(DRAWS)
     draws = (
-        replace(problem, groups=tuple(redrawn(g, p, rng) for g, p in zip(problem.groups, preds, strict=True)))
-        for _ in range(PHASES)
+        replace(problem, groups=tuple(draw(g, p, rng) for g, p in zip(problem.groups, preds, strict=True)))
+        for _ in range(DRAWS)
     )
-    return max(screen(draw, current, preds, hypotheses)[0].gain for draw in draws)
+    return max(screen(drawn, current, preds, hypotheses)[0].gain for drawn in draws)
 
 
-def redrawn(group: Group, prediction: Prediction, rng: np.random.Generator) -> Group:
+def with_other_phases(group: Group, prediction: Prediction, rng: np.random.Generator) -> Group:
     """A group of which what a model leaves has other phases, the same of all joints at a line; the sign at the mean."""
     turn = np.exp(2j * np.pi * rng.random(group.U.shape[:2]))
     turn[:, 0] = np.where(turn[:, 0].real > 0.0, 1.0, -1.0)
     return replace(group, U=prediction.U + turn[..., None] * (group.U - prediction.U))
+
+
+def with_other_scatter(group: Group, prediction: Prediction, rng: np.random.Generator) -> Group:
+    """A group of which a model leaves what its periods differ by, mixed at random, of the size of the noise of their
+    mean."""
+    S, P = group.U_periods.shape[:2]
+    mix = rng.normal(size=(S, P))
+    mix -= mix.mean(axis=1, keepdims=True)
+    mix /= np.linalg.norm(mix, axis=1, keepdims=True) * np.sqrt(P)
+    U, Q = (np.einsum("sp,splj->slj", mix, x) for x in (group.U_periods, group.Q_periods))
+    passed_on = np.einsum("lij,slj->sli", prediction.sampled_impedance, Q)
+    return replace(group, U=prediction.U + U - passed_on)
 
 
 def left_by_laws(current: Fit, told: np.ndarray) -> np.ndarray:

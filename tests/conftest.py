@@ -52,6 +52,12 @@ def through_postures(rng, n, rate, seconds):
     return t, q, v, -(np.sin(arg) * w**2) @ a - (np.cos(arg) * w**2) @ b
 
 
+def over_steps(torque, x, parts=1000):
+    """Mean of a torque of the deflection over steps of time, in each of which ``x`` (S, T) goes along a line."""
+    spread = 0.5 * np.abs(np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1))
+    return sum(torque(x + u * spread) for u in (np.arange(parts) + 0.5) / parts - 0.5) / parts
+
+
 def through_files(data, folder):
     """What a user's diagnosis sees: the files alone."""
     save_dataset(data, folder / "dataset")

@@ -23,7 +23,7 @@ from ident.torque_fit import fit
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
 from sim import parse_effect
-from tests.conftest import quick_experiment, small_plan, through_files
+from tests.conftest import over_steps, quick_experiment, small_plan, through_files
 
 pytestmark = pytest.mark.xdist_group("along_record")  # one worker makes what they share
 
@@ -72,9 +72,10 @@ def test_the_mean_torque_is_met_and_the_law_is_the_law(code, seed, mean, size):
     assert h == pytest.approx(there, abs=1e-6 * k * size + 1e-6)
     if code == kernels.BACKLASH:
         assert np.mean(k * (x + offset) + h) == pytest.approx(mean, abs=1e-6) or np.abs(x + offset).max() <= 0.5 * a
-        assert h == pytest.approx(-k * np.clip(x + offset, -0.5 * a, 0.5 * a), abs=1e-5)
-    if code == kernels.SOFTENING:
-        assert h == pytest.approx((a - k) * np.clip(x + offset, -b, b), abs=1e-5)
+    if code in (kernels.BACKLASH, kernels.SOFTENING):
+        slope, half = (-k, 0.5 * a) if code == kernels.BACKLASH else (a - k, b)
+        expected = over_steps(lambda x: slope * np.clip(x + offset, -half, half), x)
+        assert h == pytest.approx(expected, abs=kernels.RESOLVED * abs(slope) * half + 1e-5)
     if code == kernels.HYSTERESIS:
         assert h == pytest.approx(elastoplastic(x + offset, a, b), abs=1e-6)
     if code == kernels.CUBIC:

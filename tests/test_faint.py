@@ -13,7 +13,7 @@ from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.conclude import drift_note
 from ident.diagnosis import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
-from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, faint_scores, hidden, left_by_laws, seen
+from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, by_noise_alone, faint_scores, hidden, left_by_laws, seen
 from ident.hypotheses import catalogue
 from ident.model import Effect, along_record, as_loop
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
@@ -119,6 +119,24 @@ def test_a_noisier_joint_shows_less(identified, hypotheses):
     costs = baseline.counts.copy()
     costs[first.hypothesis.joint] *= 1.3
     assert seen(loud, replace(baseline, costs=costs)) is None
+
+
+def test_noise_whose_lines_go_together_shows_nothing(identified, hypotheses):
+    """A recorder of the torque whose clock is off by another 30 microseconds in each record and period: a few numbers
+    explain much of it."""
+    _, setup, baseline = identified
+    rng = np.random.default_rng(5)
+
+    def recorded(group):
+        late = 3e-5 * rng.normal(size=(*group.U_periods.shape[:2], 1, 1))
+        U_periods = group.U_periods * np.exp(-1j * group.omega[:, None] * late)
+        return replace(group, U_periods=U_periods, U=U_periods.mean(axis=1))
+
+    problem = replace(setup.problem, groups=tuple(map(recorded, setup.problem.groups)))
+    seen_at_all = seen(faint_scores(problem, baseline, hypotheses, np.zeros(6)), baseline)
+    assert seen_at_all is not None
+    assert by_noise_alone(setup.problem, baseline, hypotheses) < SEEN < by_noise_alone(problem, baseline, hypotheses)
+    assert hidden(problem, baseline, hypotheses, np.zeros(6)) == ((), 1.0)
 
 
 def single(group):

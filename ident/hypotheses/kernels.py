@@ -14,6 +14,9 @@ from numba import njit
 from ident.hypotheses.yielding import SLIP, along_path, yielding_point
 
 TURNED = 19.1  # argument beyond which tanh is one in double precision
+RESOLVED = 1e-3  # of the half of a middle, within which a step of time need not be averaged over
+LEAST_SLOPE = 1e-6  # of what is solved for the torque of a middle
+NEWTON_STEPS = 30
 VECTORS = {"contract", "reassoc", "nsz"}  # what lets the compiler step several records at once
 CUBIC, BACKLASH, SOFTENING, HYSTERESIS, LINK, CABLE = 0, 1, 2, 3, 4, 5
 
@@ -66,25 +69,12 @@ def smooth_sign(v: np.ndarray, smoothing: float) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def spring_torque(code: int, a: float, b: float, k: float, x: float, x_old: float, h_old: float) -> float:
-    """Torque beyond ``k x`` of a nonlinear gear at deflection ``x``; or of a ``CABLE``, see ``loop_sweep``, on a
-    link."""
+    """Torque beyond ``k x`` of a gear at deflection ``x`` whose law has no kinks; or of a ``CABLE``, see
+    ``loop_sweep``, on a link."""
     if code == 5:
         return a * x + min(max(h_old - a * x_old + k * (x - x_old), -b), b)
     if code == 0:
         return a * x * x * x
-    if code == 1:
-        half = 0.5 * a
-        if x > half:
-            return -k * half
-        if x < -half:
-            return k * half
-        return -k * x
-    if code == 2:
-        if x > b:
-            return (a - k) * b
-        if x < -b:
-            return -(a - k) * b
-        return (a - k) * x
     return min(max(h_old + a * (x - x_old), -b), b)
 
 
@@ -109,23 +99,88 @@ def spring_point(
         if h < -b:
             return free + direct * b
         return x
-    if code == 5:
-        held = h_old - (a + k) * x_old
-        x = (free - direct * held) / (1.0 + direct * (a + k))
-        z = held + k * x
-        if z > b:
-            return (free - direct * b) / (1.0 + direct * a)
-        if z < -b:
-            return (free + direct * b) / (1.0 + direct * a)
-        return x
-    half, slope = (0.5 * a, -k) if code == 1 else (b, a - k)
-    inner = max(1.0 + direct * slope, 1e-6)
-    x = free / inner
-    if x > half:
-        return free - direct * slope * half
-    if x < -half:
-        return free + direct * slope * half
+    held = h_old - (a + k) * x_old
+    x = (free - direct * held) / (1.0 + direct * (a + k))
+    z = held + k * x
+    if z > b:
+        return (free - direct * b) / (1.0 + direct * a)
+    if z < -b:
+        return (free + direct * b) / (1.0 + direct * a)
     return x
+
+
+@njit(cache=True, nogil=True)
+def middle_of(code: int, a: float, b: float, k: float) -> tuple[float, float]:
+    """What the middle of a dead band, or of a gear that is softer there, takes of the spring, N m/rad, and its half,
+    rad."""
+    return (k, 0.5 * a) if code == 1 else (k - a, b)
+
+
+@njit(cache=True, nogil=True)
+def taken(half: float, lag: float, x: float) -> float:
+    """What a middle ``half`` wide to either side takes from a gear at ``x``, as a deflection of what is taken there.
+
+    ``lag`` is that of the damper which is taken with the spring, over the spring. A flank carries what is not taken
+    from it, and never pulls.
+    """
+    if x > half:
+        return min(x + lag, half)
+    return max(x + lag, -half) if x < -half else x + lag
+
+
+@njit(cache=True, nogil=True)
+def taken_until(half: float, lag: float, x: float) -> float:
+    """Integral of ``taken`` by ``x``, for a ``lag`` of at least zero."""
+    if x <= -half - lag:
+        return -half * x
+    inside = min(x, half)
+    total = half * (half + lag) + 0.5 * ((inside + lag) ** 2 - half**2)
+    return total + half * (x - inside)
+
+
+@njit(cache=True, nogil=True)
+def mean_taken(half: float, lag: float, x: float, spread: float) -> float:
+    """Mean of ``taken`` over ``x`` plus and minus half of ``spread``, which the deflection goes in a step of time."""
+    if lag < 0.0:
+        return -mean_taken(half, -lag, -x, spread)
+    low, high = x - 0.5 * spread, x + 0.5 * spread
+    if low > half or high < -half - lag or (low > -half - lag and high < half) or spread < RESOLVED * half:
+        return taken(half, lag, x)
+    return (taken_until(half, lag, high) - taken_until(half, lag, low)) / spread
+
+
+@njit(cache=True, nogil=True)
+def middle_torque(
+    slope: float, half: float, lag: float, q: float, v: float, dq: float, dv: float, spread: float
+) -> float:
+    """Torque ``h = -slope mean_taken`` of a middle at ``x = q - dq h`` with the velocity ``v - dv h``.
+
+    By Newton's steps from where the gear is not within its middle, or is at one point of it.
+
+    Args:
+        lag: time by which what is taken is late, s.
+    """
+    h = -slope * (q + lag * v) / max(1.0 - slope * (dq + lag * dv), LEAST_SLOPE)
+    x, most = q - dq * h, slope * half
+    if x > half:
+        h = max(h, -most) if slope > 0.0 else min(h, -most)
+    elif x < -half:
+        h = min(h, most) if slope > 0.0 else max(h, most)
+    if spread < RESOLVED * half:
+        return h
+    best, least = h, np.inf
+    for _ in range(NEWTON_STEPS):
+        x, late = q - dq * h, lag * (v - dv * h)
+        miss = h + slope * mean_taken(half, late, x, spread)
+        if abs(miss) < least:
+            best, least = h, abs(miss)
+        if abs(miss) <= 1e-9 * abs(most):
+            break
+        low, high = x - 0.5 * spread, x + 0.5 * spread
+        rise = (taken(half, late, high) - taken(half, late, low)) / spread
+        within = max(min(high, half) - max(low, -half), 0.0) / spread
+        h -= miss / max(1.0 - slope * (dq * rise + dv * lag * within), LEAST_SLOPE)
+    return best
 
 
 def sees_rate(law: Law) -> bool:
@@ -147,10 +202,11 @@ def mean_slope(law: Law, x: np.ndarray) -> np.ndarray:
     """
     if law.code == CUBIC:
         return 3.0 * law.a * np.mean(x**2, axis=1)
-    if law.code == BACKLASH:
-        return -law.k * np.mean(np.abs(x) < 0.5 * law.a, axis=1)
-    if law.code == SOFTENING:
-        return (law.a - law.k) * np.mean(np.abs(x) < law.b, axis=1)
+    if law.code in (BACKLASH, SOFTENING):
+        slope, half = middle_of(law.code, law.a, law.b, law.k)
+        spread = np.maximum(0.5 * np.abs(np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1)), RESOLVED * half)
+        within = np.minimum(x + 0.5 * spread, half) - np.maximum(x - 0.5 * spread, -half)
+        return -slope * np.mean(np.maximum(within, 0.0) / spread, axis=1)
     if law.code == LINK:
         return np.full(len(x), law.a)
     x = x - x.mean(axis=1, keepdims=True)
@@ -164,8 +220,23 @@ def along_motion(law: Law, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
         return law.a * x + law.b * np.tanh(rate / law.k)
     if law.code == CABLE:
         return law.a * x + along_path(np.diff(x, axis=1, prepend=x[:, -1:]), law.k, law.b, SLIP, 0.0)
-    torque = along_deflection(*law.shape, x, np.zeros(len(x)), 0)
-    return torque - law.b * rate * (np.abs(x) < 0.5 * law.a) if law.code == BACKLASH else torque
+    if law.code in (BACKLASH, SOFTENING):
+        slope, half = middle_of(law.code, law.a, law.b, law.k)
+        late = law.b * rate / law.k if law.code == BACKLASH else np.zeros_like(x)
+        return -slope * along_middle(half, late, x)
+    return along_deflection(*law.shape, x, np.zeros(len(x)), 0)
+
+
+@njit(cache=True, nogil=True)
+def along_middle(half: float, late: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """``mean_taken`` (S, T) along a periodic motion; ``late`` (S, T) rad, its ``lag``."""
+    S, T = x.shape
+    out = np.empty((S, T))
+    for i in range(S):
+        for t in range(T):
+            spread = 0.5 * abs(x[i, (t + 1) % T] - x[i, t - 1])
+            out[i, t] = mean_taken(half, late[i, t], x[i, t], spread)
+    return out
 
 
 def along_deflection(
@@ -202,6 +273,7 @@ def _moved_to_mean(
     S, T = x.shape
     out = np.empty((S, T))
     least = k if code != 2 else min(a, k)
+    slope, half = middle_of(code, a, b, k)
     for i in range(S):
         reach = 0.0
         for t in range(T):
@@ -213,7 +285,11 @@ def _moved_to_mean(
             total = 0.0
             for t in range(T):
                 new = x[i, t] + offset
-                out[i, t] = spring_torque(code, a, b, k, new, new, 0.0)
+                if code == 0:
+                    out[i, t] = a * new * new * new
+                else:
+                    spread = 0.5 * abs(x[i, (t + 1) % T] - x[i, t - 1])
+                    out[i, t] = -slope * mean_taken(half, 0.0, new, spread)
                 total += k * new + out[i, t]
             miss = total / T - mean[i]
             if code != 1 and abs(miss) <= 1e-11 * k * reach:
@@ -256,16 +332,6 @@ def link_point(stiffness: float, friction: float, turn: float, q: float, v: floa
     return (stiffness * q + (friction * y if wanted >= 0 else -friction * y)) / slope
 
 
-@njit(cache=True, nogil=True)
-def loose_point(gap: float, damping: float, k: float, q: float, v: float, dq: float, dv: float) -> float:
-    """Torque ``h`` that takes spring and damper from a gear within its dead band: there ``-k x - damping x'`` at ``x =
-    q - dq h``."""
-    h = -(k * q + damping * v) / max(1.0 - k * dq - damping * dv, 1e-6)
-    if abs(q - dq * h) <= 0.5 * gap:
-        return h
-    return -0.5 * k * gap if q - dq * h > 0.0 else 0.5 * k * gap
-
-
 @njit(cache=True, nogil=True, fastmath=VECTORS)
 def loop_sweep(
     code: int,
@@ -301,6 +367,9 @@ def loop_sweep(
     """
     T, S = linear.shape
     rounded, damped = code == 3 and exponent < SLIP, code == 1 and b > 0.0
+    middle = code == 1 or code == 2
+    slope, half = middle_of(code, a, b, k)
+    lag = b / k if damped else 0.0
     poles, decay, gain_old, gain_new = modes
     # A mode without the share of the torque of this step: that of the next one follows from both in one go.
     gain = decay * gain_new + gain_old
@@ -342,11 +411,17 @@ def loop_sweep(
         elif code == 4:
             for i in range(S):
                 h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
-        elif damped:
+        elif middle:
             for i in range(S):
-                h[i] = loose_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
+                new, spread = x[i], abs(x[i] - past[i])
+                for _ in range(2):  # how far it goes in this step is not known before
+                    h[i] = middle_torque(slope, half, lag, free[i], free_rate[i], direct, direct_rate, spread)
+                    new = free[i] - direct * h[i]
+                    spread = abs(new - x[i])
+                    if abs(abs(new) - half) > spread + lag * abs(free_rate[i]):
+                        break
                 past[i] = x[i]
-                x[i] = free[i] - direct * h[i]
+                x[i] = new
         else:
             for i in range(S):
                 if rounded:

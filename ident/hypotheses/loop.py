@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.hypotheses.kernels import CABLE, HYSTERESIS, LINK, Law, loop_sweep, spring_torque
+from ident.hypotheses.kernels import CABLE, HYSTERESIS, LINK, Law, along_motion, loop_sweep
 from ident.mixing import MEMORY, mixed
 
 SWEEPS = 25  # periods at most until the steady state
@@ -51,7 +51,7 @@ def steady_loop(
     elif code == CABLE:
         h = a * x
     else:
-        h = np.array([spring_torque(code, a, b, k, v, v, 0.0) for v in x])
+        h = along_motion(law, x[:, None], np.zeros((S, 1)))[:, 0]
     memory, left = np.stack([x, x, h]), np.arange(S)
     out, part = np.zeros((T, S)), np.zeros((T, S))
     past: list[tuple[np.ndarray, np.ndarray]] = []
