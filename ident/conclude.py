@@ -45,6 +45,7 @@ AXIS_STEP = 1e-6  # of a tilt
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 TOLD = 0.2  # standard deviation of the Coulomb friction that drifts over its size, up to which the data show it
+FAR_OFF = 1.5  # error of held-out data over their noise, from which it is told
 RIVAL = 0.1  # of the probability of a cause, above which the sentence tells a rival too
 
 
@@ -153,6 +154,7 @@ def conclude(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
             *(few_note(final) if few and causes else ()),
             *faint_note(result),
+            *(() if detected else held_out_note(gain)),
             *(() if named_effects(final) else drift_note(problem)),
             *(tone_note(x, dataset.joints[x.joint]) for x in tones),
             *(belied_note(e) for e in named_effects(final) if e.hypothesis.key in belied),
@@ -235,6 +237,16 @@ def faint_note(result: Attribution) -> tuple[str, ...]:
     return (
         f"The model leaves {result.baseline.chi2_per_dof:.3g} times the power of the noise that was estimated: more than chance"
         f" (p = {result.p_value:.1g}), but up to {DETECTION_EXCESS:g} times may be an error of that estimate.",
+    )
+
+
+def held_out_note(gain: Gain | None) -> tuple[str, ...]:
+    """Joints of which held-out data differ although those that were fitted do not, in a sentence; nothing where none
+    does."""
+    off = {j: x.before / x.noise_floor for j, x in gain.by_joint.items()} if gain else {}
+    far = [f"{x:.3g} times the noise at {j}" for j, x in off.items() if x > FAR_OFF]
+    return (
+        (f"Held-out data are off by {' and '.join(far)}: what they miss the fitted data do not show.",) if far else ()
     )
 
 

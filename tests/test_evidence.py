@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, companions, less_errors_of_laws
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
-from ident.conclude import _cause, _drifting_friction, conclude, faint_note
+from ident.conclude import _cause, _drifting_friction, conclude, faint_note, held_out_note
 from ident.contests import alike, best_of_each, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
@@ -53,7 +53,7 @@ from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, 
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
 from ident.trust import fails_held_out, patchwork, shadowed, shown
-from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, Value
+from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, JointGain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -792,6 +792,9 @@ def test_an_effect_at_its_bounds_is_none(named):
     assert not pointless(Effect(spring, np.array([300.0, 1.0])), 1e4)
     soft = named["softening_stiffness", "elbow_joint"]  # as soft as a dead band, it is one
     assert [pointless(Effect(soft, np.array([share * 1e4, 1e-4])), 1e4) for share in (0.02, 0.3)] == [True, False]
+    dip = named["stribeck_friction", "elbow_joint"]  # of a friction that vanishes in motion there is none
+    falls = [pointless(Effect(dip, np.array([coulomb, 1.0, 0.05, 1e-3])), 1e4) for coulomb in (0.95, 0.5, 0.15, 0.01)]
+    assert falls == [True, False, False, True]
 
 
 def test_a_gear_far_from_its_guess_has_gone_astray(identified):
@@ -1224,6 +1227,14 @@ def test_what_is_no_chance_and_yet_no_discrepancy_is_said():
     (said,) = notes(False, 1e-14)
     assert "1.07 times" in said and "p = 1e-14" in said
     assert notes(False, 0.3) == () == notes(True, 1e-14)
+
+
+def test_held_out_data_that_are_off_beside_fitted_ones_that_are_not_are_told():
+    gain = SimpleNamespace(by_joint={"a": JointGain(3.4, 3.4, 2.0), "b": JointGain(1.2, 1.2, 1.0)})
+    (said,) = held_out_note(gain)
+    assert "1.7 times the noise at a" in said and "at b" not in said
+    gain.by_joint.pop("a")
+    assert held_out_note(gain) == () == held_out_note(None)
 
 
 def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identified, named):

@@ -25,6 +25,7 @@ LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
 LEAST_DIP = 1.15  # static friction over Coulomb's, below which it is as good as that
+MOST_DIP = 10.0  # the same, beyond which nothing rubs in motion: no friction of a bearing
 TURN_SHARE = 2e-3  # velocity within which a friction turns over that of its dip, at first
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
@@ -217,7 +218,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "shown": "static",
             "special": lambda p: np.array([p[0], 0.0, p[3]]),
             "dry": True,
-            "trivial": lambda p, k: p[1] < LEAST_DIP * p[0],
+            "trivial": lambda p, k: not LEAST_DIP * p[0] < p[1] < MOST_DIP * p[0],
             "plain": lambda p: p[1] < LEAST_DIP * p[0],
             "within": lambda p: p[2],
             "widens": lambda p, s: [np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2]]) for f in (0.05, 0.3)],
