@@ -1,9 +1,15 @@
 """Intervals of the gain: how often they hold what they are for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from ident.diagnosis import diagnose
 from ident.gain import Errors, line_squares, mean_squares, measure_gain
+from ident.verdict import UNKNOWN
+from sim import parse_effect
+from tests.conftest import quick_experiment, small_plan, through_files
 
 LINES, DRAWS = 120, 150
 NOISE = 0.02
@@ -97,3 +103,16 @@ def test_a_gap_within_the_noise_of_some_records_has_no_interval():
     told = measure_gain(Errors(("a", "b", "c"), *rows), {"drive": "N m"}, [0], "method", np.random.default_rng(0))
     low, high = told.ci95
     assert 0.9 < low <= told.gap_closed <= high < 1.5
+
+
+def test_a_cause_that_harms_held_out_data_is_taken_back(locked, tmp_path):
+    """A spring that was taken off before the data that are held out were recorded."""
+    plan = small_plan(locked, 4, levels=(1.0,))
+    spring = parse_effect("gravity_spring@elbow_joint:stiffness=60,rest_angle=0.3", locked)
+    held, bare = (quick_experiment(plan, effects, seed=4) for effects in ([spring], []))
+    segments = tuple(b if b.role == "validation" else a for a, b in zip(held.segments, bare.segments, strict=True))
+    verdict = diagnose(through_files(replace(held, segments=segments), tmp_path), max_causes=1)
+    (note,) = (x for x in verdict.notes if x.startswith("Taken back: gravity_spring at elbow_joint."))
+    assert "predicted worse" in note
+    assert not verdict.causes and verdict.unexplained_verdict == UNKNOWN
+    assert verdict.gain.before == verdict.gain.after
