@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace
 
@@ -45,6 +46,7 @@ STYLE = {
 }
 POINTS = 1500
 CURVE = 300
+FREQUENCIES = 1.0, 2.0, 5.0  # that are told of each decade
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -82,6 +84,8 @@ def _logarithmic(axes: np.ndarray) -> None:
     for ax in axes.flat:
         if ax.get_xscale() != "log":
             ax.set_xscale("log")
+            ax.xaxis.set_major_locator(LogLocator(subs=FREQUENCIES))
+            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         ax.set_yscale("log")
         ax.minorticks_off()
 
