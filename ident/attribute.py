@@ -23,7 +23,7 @@ from ident.hypotheses import Hypothesis, catalogue
 from ident.model import Effect, is_along_record
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
-from ident.pruning import plainer, plainly_special, pruned, renamed, without_shadows
+from ident.pruning import plainer, plainly_special, pruned, renamed, untold, without_shadows
 from ident.refits import (
     FAINT,
     POLISH_STEPS,
@@ -161,7 +161,8 @@ def attribute(
     current = without_shadows(problem, current, rounds, workers)
     current, rounds = weighed_again(problem, current, rounds, workers)
     effects = current.model.effects
-    itself = [e for e in effects if not plainly_special(problem, current.model, e)]
+    # What a cause had that sets it apart from its special case may have been what one that was found later does.
+    itself = [e for e in effects if not (plainly_special(problem, current.model, e) or untold(current, e))]
     if len(itself) < len(effects) and not workers.late:
         current = plainer(problem, current, every, {e.hypothesis.key for e in itself})
         rounds = renamed(rounds, effects, current.model.effects)

@@ -18,7 +18,7 @@ from ident.columns import Products
 from ident.extended import Prediction, moves_plane, predict_at
 from ident.group import Group
 from ident.inverse import Sampling, make_plane
-from ident.model import Effect, Model
+from ident.model import Effect, Model, is_linear
 from ident.stiction import as_held
 
 MOST = 0.9  # of the information on any direction of the coordinates, that may be taken off as noise
@@ -151,7 +151,7 @@ def impedance_slopes(
         effect: its number in the model; steps: parameters after a step of each coordinate, and the step.
     """
     h, K = model.effects[effect].hypothesis, group.n_compared
-    if h.channel != "model" and "filter" not in h.options and not moves_plane(h):
+    if not (is_linear(h) or moves_plane(h)):
         return
     held = {"W": pred.solution.W, "torques": pred.solution.torques}
     elsewhere = pred.about is not pred.plane and (h.channel == "model" or moves_plane(h))

@@ -23,7 +23,7 @@ from ident.baseline import DETECTION_EXCESS
 from ident.extended import Prediction
 from ident.group import Group
 from ident.hypotheses import Hypothesis
-from ident.model import has_rough_law, is_along_record
+from ident.model import has_rough_law, is_along_record, is_linear
 from ident.noise import drifting
 from ident.problem import Problem, predictions
 from ident.screening import Score, screen
@@ -85,8 +85,32 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
     if not hypotheses:
         return []
     at_joints = left_by_laws(current, told)
-    scores = screen(problem, current, predictions(problem, current.model, current.remainders), hypotheses)
+    preds = predictions(problem, current.model, current.remainders)
+    scores = in_signal(problem, current, preds, screen(problem, current, preds, hypotheses))
     return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]
+
+
+def in_signal(problem: Problem, current: Fit, preds: Sequence[Prediction], scores: Sequence[Score]) -> list[Score]:
+    """Scores of which those of linear hypotheses are no more than what these explain at rest and at lines that some
+    record excites, best first; where they would be seen.
+
+    At other lines a linear arm answers noise alone, and what noise adds there is known by as few periods as were
+    recorded.
+    """
+    linear = [s.hypothesis for s in scores if s.gain > SEEN and is_linear(s.hypothesis)]
+    if not linear:
+        return list(scores)
+
+    def there_alone(whiten: np.ndarray, group: Group) -> np.ndarray:
+        signal = np.any(group.excited, axis=0)[: len(whiten)]
+        signal[0] = True
+        return whiten * signal[:, None, None]
+
+    whiten = tuple(map(there_alone, current.weights.whiten, problem.groups))
+    there = screen(problem, replace(current, weights=replace(current.weights, whiten=whiten)), preds, linear)
+    most = {id(s.hypothesis): s.gain for s in there}
+    least = [replace(s, gain=min(s.gain, most.get(id(s.hypothesis), s.gain))) for s in scores]
+    return sorted(least, key=lambda s: -s.gain)
 
 
 def scatter_is_seen(problem: Problem) -> bool:

@@ -92,6 +92,11 @@ def simulated_laws(model: Model) -> Model:
     return replace(model, effects=tuple(replace(e, hypothesis=as_loop(e.hypothesis)) for e in model.effects))
 
 
+def is_linear(hypothesis: Hypothesis) -> bool:
+    """Whether small motions answer an effect line by line: a change of the chain, a filter of a drive or a sensor."""
+    return hypothesis.channel == "model" or "filter" in hypothesis.options
+
+
 def has_loop(effect: Effect) -> bool:
     """Whether an effect moves the arm by which it is moved: a loop, solved in one pass."""
     return effect.hypothesis.gear_law or "loop" in effect.hypothesis.options

@@ -13,13 +13,14 @@ from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.conclude import drift_note
 from ident.diagnosis import diagnose, explained
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
-from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, by_noise_alone, faint_scores, hidden, left_by_laws, seen
+from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, by_noise_alone, faint_scores, hidden, in_signal, left_by_laws, seen
 from ident.hypotheses import catalogue
 from ident.model import Effect, along_record, as_loop
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
 from ident.problem import predictions
 from ident.refits import refit
 from ident.rounds import Round, temper_of, told_share, weighed_round
+from ident.screening import Score
 from ident.search import hopeful
 from ident.trust import denied
 from ident.verdict import UNKNOWN
@@ -137,6 +138,18 @@ def test_noise_whose_lines_go_together_shows_nothing(identified, hypotheses):
     assert seen_at_all is not None
     assert by_noise_alone(setup.problem, baseline, hypotheses) < SEEN < by_noise_alone(problem, baseline, hypotheses)
     assert hidden(problem, baseline, hypotheses, np.zeros(6)) == ((), 1.0)
+
+
+def test_linear_hypotheses_are_seen_at_lines_that_hold_signal(identified, hypotheses):
+    """At others the arm answers noise alone; what is not linear shows there."""
+    _, setup, baseline = identified
+    preds = predictions(setup.problem, baseline.model, baseline.remainders)
+    linear, other = (next(h for h in hypotheses if h.effect == x) for x in ("unknown:position_scale", "cogging"))
+    scores = [Score(h, SEEN + 10.0, 1, None, np.zeros(1), ()) for h in (linear, other)]
+    first, last = in_signal(setup.problem, baseline, preds, scores)
+    assert first == scores[1] and last.hypothesis is linear and last.gain < 0.5 * SEEN
+    silent = [replace(s, gain=SEEN - 1.0) for s in scores]
+    assert in_signal(setup.problem, baseline, preds, silent) == silent
 
 
 def single(group):
