@@ -36,9 +36,8 @@ ROUGH = 10.0
 # of what the clearest explains, below which no other can be the cause: of faint ones linear steps tell nearly all
 LINEAR = 0.3
 DRAWS = 4  # of what noise may have left
-BY_PHASES = (
-    2.5  # factor on what the best of all hypotheses explains of other phases, from which a faint cause is sought
-)
+# factor on what the best of all hypotheses explains of other phases, from which a faint cause is sought
+BY_PHASES = 2.5
 # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 SHADOW = 1e-3
 
@@ -104,6 +103,7 @@ def in_signal(problem: Problem, current: Fit, preds: Sequence[Prediction], score
     def there_alone(whiten: np.ndarray, group: Group) -> np.ndarray:
         signal = np.any(group.excited, axis=0)[: len(whiten)]
         signal[0] = True
+        signal |= not np.any(signal[1:])  # of a record that does not say what it excites
         return whiten * signal[:, None, None]
 
     whiten = tuple(map(there_alone, current.weights.whiten, problem.groups))
