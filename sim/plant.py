@@ -124,7 +124,7 @@ def build_spec(
     for j, joint in enumerate(robot.joints):
         _add_drive(spec, joint.name, {f: figures[f][j] for f in DRIVE_FIELDS})
     # What a motor turns besides joins all springs of that gear, whichever effect adds them.
-    for effect in sorted(effects, key=lambda e: e.name == "joint_coupling"):
+    for effect in sorted(effects, key=lambda e: getattr(e, "name", "") == "joint_coupling"):
         edit = getattr(effect, "edit", None)
         if edit is not None:
             edit(spec, robot, figures)

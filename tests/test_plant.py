@@ -310,6 +310,15 @@ def test_two_hinges_about_one_axis_are_an_error():
         build_plant(irb, [second])
 
 
+def test_an_effect_of_the_users_own_needs_no_name(ur10):
+    class Heavy:
+        def edit(self, spec, robot, drives):
+            spec.joint("motor:elbow_joint").armature += 1.0
+
+    plain, heavy = (build_plant(ur10, effects).model.dof_armature for effects in ([], [Heavy()]))
+    assert np.sum(heavy - plain) == pytest.approx(1.0)
+
+
 def test_a_simulation_that_diverges_is_an_error(ur10):
     """A hinge without mass between, along the joint's own axis, has a singular inertia."""
     axis = read_urdf(ur10.urdf).axes["shoulder_pan_joint"]
