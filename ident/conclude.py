@@ -243,11 +243,9 @@ def faint_note(result: Attribution) -> tuple[str, ...]:
 def held_out_note(gain: Gain | None) -> tuple[str, ...]:
     """Joints of which held-out data differ although those that were fitted do not, in a sentence; nothing where none
     does."""
-    off = {j: x.before / x.noise_floor for j, x in gain.by_joint.items()} if gain else {}
-    far = [f"{x:.3g} times the noise at {j}" for j, x in off.items() if x > FAR_OFF]
-    return (
-        (f"Held-out data are off by {' and '.join(far)}: what they miss the fitted data do not show.",) if far else ()
-    )
+    off = {j: x.before / x.noise_floor for j, x in gain.by_joint.items() if x.noise_floor > 0.0} if gain else {}
+    far = " and ".join(f"{x:.3g} times the noise at {j}" for j, x in off.items() if x > FAR_OFF)
+    return (f"Held-out data are off by {far}: what they miss the fitted data do not show.",) if far else ()
 
 
 def few_note(final: Fit) -> tuple[str, ...]:

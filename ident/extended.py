@@ -228,9 +228,9 @@ def _about_motion(model: Model, motion: Motion, structure: Structure, plane: Pla
         return plane
     lin = linearise(structure, motion.solution.Q_a[:, 0].real.mean(axis=0))
     for h, p in ((e.hypothesis, e.p) for e in effects if e.hypothesis.channel == "link"):
-        loop = h.options.get("loop")
-        slope = np.mean(kernels.mean_slope(loop(p), motion.q_link(h.joint))) if loop else h.options["slope"](p)
-        lin.Kg[structure.driven[h.joint], structure.driven[h.joint]] += slope
+        loop, q = h.options.get("loop"), motion.q_link(h.joint)
+        slope = kernels.mean_slope(loop(p), q) if loop else h.options["slope"](p, q)
+        lin.Kg[structure.driven[h.joint], structure.driven[h.joint]] += np.mean(slope)
     return plane_at(structure, motion.par, lin, motion.group, plane.record)
 
 

@@ -93,6 +93,13 @@ def test_a_law_along_a_motion_is_the_law_and_its_mean_slope_what_a_small_step_do
     h = kernels.along_motion(law, x, v)
     if law.code in (kernels.BACKLASH, kernels.SOFTENING):
         assert h == pytest.approx(over_steps(lambda x: law_along(law, x, v), x), abs=1e-3 * np.abs(h).max())
+        _, half = kernels.middle_of(law.code, law.a, law.b, law.k)
+        near = np.abs(np.diff(x, axis=1, append=x[:, :1])).max() + law.b * np.abs(v) / law.k * (
+            law.code == kernels.BACKLASH
+        )
+        alone = np.abs(np.abs(x) - half) > near  # steps without a kink
+        assert 0.1 < alone.mean() < 1.0
+        assert h[alone] == pytest.approx(law_along(law, x, v)[alone], abs=1e-9 * np.abs(h).max())
     else:
         assert h == pytest.approx(law_along(law, x, v), abs=1e-9 * np.abs(h).max())
     slope = kernels.mean_slope(law, x)

@@ -140,8 +140,9 @@ class Hypothesis:
             ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a
             spring.
             ``filter(p, s)``: recorded torque per delivered one, or true position per measured one, of one that is
-                linear, (L,). ``slope(p, q)``: true position per measured one, of one that is not, at true positions;
-            ``slope(p)`` of a spring to the link, N m/rad.
+                linear, (L,).
+            ``slope(p, q)``: of one that is not, true position per measured one at true positions; of a spring to the
+                link, N m/rad at positions of that.
             ``nearer(p)``: the hypothesis of the same hinge sought from another axis, and its parameters, where its own
                 is nearer to that.
             ``of_record``: of a decoy that lies in how the record was made, and so leaves no cause unknown.

@@ -150,6 +150,12 @@ def mean_taken(half: float, lag: float, x: float, spread: float) -> float:
 
 
 @njit(cache=True, nogil=True)
+def in_a_step(x: np.ndarray, t: int) -> float:
+    """How far a periodic motion (T,) goes in the step about a point of it."""
+    return 0.5 * abs(x[(t + 1) % len(x)] - x[t - 1])
+
+
+@njit(cache=True, nogil=True)
 def middle_torque(
     slope: float, half: float, lag: float, q: float, v: float, dq: float, dv: float, spread: float
 ) -> float:
@@ -160,12 +166,13 @@ def middle_torque(
     Args:
         lag: time by which what is taken is late, s.
     """
-    h = -slope * (q + lag * v) / max(1.0 - slope * (dq + lag * dv), LEAST_SLOPE)
-    x, most = q - dq * h, slope * half
+    y = (q + lag * v) / max(1.0 - slope * (dq + lag * dv), LEAST_SLOPE)  # where all is taken
+    x = q + dq * slope * y
     if x > half:
-        h = max(h, -most) if slope > 0.0 else min(h, -most)
+        y = min(y, half)
     elif x < -half:
-        h = min(h, most) if slope > 0.0 else max(h, most)
+        y = max(y, -half)
+    h = -slope * y
     if spread < RESOLVED * half:
         return h
     best, least = h, np.inf
@@ -174,7 +181,7 @@ def middle_torque(
         miss = h + slope * mean_taken(half, late, x, spread)
         if abs(miss) < least:
             best, least = h, abs(miss)
-        if abs(miss) <= 1e-9 * abs(most):
+        if abs(miss) <= 1e-9 * abs(slope) * half:
             break
         low, high = x - 0.5 * spread, x + 0.5 * spread
         rise = (taken(half, late, high) - taken(half, late, low)) / spread
@@ -234,8 +241,7 @@ def along_middle(half: float, late: np.ndarray, x: np.ndarray) -> np.ndarray:
     out = np.empty((S, T))
     for i in range(S):
         for t in range(T):
-            spread = 0.5 * abs(x[i, (t + 1) % T] - x[i, t - 1])
-            out[i, t] = mean_taken(half, late[i, t], x[i, t], spread)
+            out[i, t] = mean_taken(half, late[i, t], x[i, t], in_a_step(x[i], t))
     return out
 
 
@@ -286,10 +292,9 @@ def _moved_to_mean(
             for t in range(T):
                 new = x[i, t] + offset
                 if code == 0:
-                    out[i, t] = a * new * new * new
+                    out[i, t] = spring_torque(code, a, b, k, new, new, 0.0)
                 else:
-                    spread = 0.5 * abs(x[i, (t + 1) % T] - x[i, t - 1])
-                    out[i, t] = -slope * mean_taken(half, 0.0, new, spread)
+                    out[i, t] = -slope * mean_taken(half, 0.0, new, in_a_step(x[i], t))
                 total += k * new + out[i, t]
             miss = total / T - mean[i]
             if code != 1 and abs(miss) <= 1e-11 * k * reach:

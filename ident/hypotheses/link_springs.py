@@ -41,7 +41,7 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
         variable="q",
         options={
             "trivial": lambda p, k: abs(p[1]) > 0.95 * FARTHEST_REST,  # a constant torque
-            "slope": lambda p: p[0],
+            "slope": lambda p, q: p[0],
         },
     )
 
