@@ -51,7 +51,7 @@ def jacobian(
     baseline = Columns(base, np.arange(m), late[..., None], np.array([m]))
     if posture is not None:
         baseline = baseline.replaced(_sagging(baseline, pred, posture))
-    baseline = baseline.replaced(_passed_on(baseline, model, group, pred))
+    baseline = baseline.replaced(_passed_on(baseline, model, pred))
     baseline = baseline.replaced(_differences(problem, model, group, pred, remade, sway, exact, posture))
     if not problem.free_timing:
         baseline.whole[..., baseline.whole_at == m] = 0.0
@@ -103,7 +103,7 @@ def _change(group: Group, there: Prediction, base: Prediction, posture: np.ndarr
         posture: of ``moved_by_posture`` at the compared lines, which stands for what the remainder would do; None holds
             it.
     """
-    change = (there.outputs(group) - base.outputs(group))[:, : compared_lines(group)]
+    change = (there.outputs() - base.outputs())[:, : compared_lines(group)]
     if posture is None:
         return change
     # A plane of its own stands at another posture already.
@@ -151,14 +151,14 @@ def _differences(
     return {c: column(c, step) for c, step in steps.items()}
 
 
-def _passed_on(columns: Columns, model: Model, group: Group, pred: Prediction) -> dict[int, np.ndarray]:
+def _passed_on(columns: Columns, model: Model, pred: Prediction) -> dict[int, np.ndarray]:
     """Baseline columns of the torque that drives with effects pass on; none where there are no such drives."""
     drives = _drives(model)
     if not drives:
         return {}
     dense = columns.dense()
     for effect in drives:
-        j, motion = effect.hypothesis.joint, pred.motion(group)
+        j, motion = effect.hypothesis.joint, pred.motion()
         full = np.zeros((dense.shape[-1], *pred.U.shape[:2]), complex)
         full[:, :, : dense.shape[1]] = np.moveaxis(dense[:, :, j], -1, 0)
         passed = _change_passed(effect, motion, full)
@@ -237,7 +237,7 @@ def _motor_columns(
 ) -> list[np.ndarray]:
     """Derivatives by a law at the motor: the motion does not change, and only its own torque does."""
     h, j = effect.hypothesis, effect.hypothesis.joint
-    motion = beside(model.effects, effect, pred.motion(group))
+    motion = beside(model.effects, effect, pred.motion())
     k = pred.par.stiffness[j]
     now, columns = h.law(effect.p, motion, j, k), []
     drives = [e for e in _drives(model) if e.hypothesis.joint == j]
@@ -255,7 +255,7 @@ def _drive_columns(
     model: Model, group: Group, pred: Prediction, effect: Effect, steps: Sequence[tuple[np.ndarray, float]]
 ) -> list[np.ndarray]:
     """Derivatives by a drive with an effect: what it is given does not change."""
-    motion, n, columns = pred.motion(group), model.structure.n, []
+    motion, n, columns = pred.motion(), model.structure.n, []
     drives = _drives(model)
     for p, step in steps:
         out = np.zeros((*pred.U.shape[:2], n + len(group.links)), complex)

@@ -158,14 +158,14 @@ def impedance_slopes(
     for p, step in steps:
         effects = tuple(Effect(h, p) if i == effect else e for i, e in enumerate(model.effects))
         there = Model(model.structure, model.par, effects)
-        structure, par, plane, about = pred.structure, pred.par, pred.plane, pred.about
+        structure, par, plane = pred.structure, pred.par, pred.plane
         if h.channel == "model":
             structure, par = there.built()
-            plane = about = make_plane(structure, par, group, sampling)
+            plane = make_plane(structure, par, group, sampling)
         if elsewhere:
             moved = predict_at(there, structure, par, plane, group, sampling, **held)
         else:
-            moved = replace(pred, model=there, structure=structure, par=par, plane=plane, about=about)
+            moved = replace(pred, model=there, structure=structure, par=par, plane=plane)
         yield (moved.sampled_impedance[:K] - pred.sampled_impedance[:K]) / step
 
 

@@ -27,34 +27,48 @@ class Prediction:
 
     Attributes:
         plane: the linear arm that it was computed with.
-        about: that for small changes about the motion: in the posture that it has, where an encoder that is out of
-            centre tells another one, and with springs to the links.
-        added_stiffness: (n,) of effects in parallel with the gears, about the motion, N m/rad.
-        position_slopes: (n,) true position per measured one of encoders that err with it, about the motion.
     """
 
     model: Model
+    group: Group
     sampling: Sampling
     structure: Structure
     par: Parameters
     plane: Plane
-    about: Plane
     solution: Solution
     U: np.ndarray
-    added_stiffness: np.ndarray
-    position_slopes: np.ndarray
 
-    def motion(self, group: Group) -> Motion:
+    def motion(self) -> Motion:
         """The predicted motion in time, with the torque that its drives deliver."""
-        drives = [e for e in self.model.effects if e.hypothesis.channel == "drive"]
-        told = joints_along_record(self.model, group)
-        return Motion(group, self.solution, self.par, delivered=delivered(drives, group, self.plane), told=told)
+        given = delivered(_of_channel(self.model, "drive"), self.group, self.plane)
+        return replace(self.bare_motion, delivered=given, told=joints_along_record(self.model, self.group))
 
-    def outputs(self, group: Group) -> np.ndarray:
+    def outputs(self) -> np.ndarray:
         """(S, L, n + M) predicted recorded torque, N m, and link positions, rad, as ``Group.outputs``."""
-        if not group.links:
+        if not self.group.links:
             return self.U
-        return np.concatenate([self.U, self.solution.Q_driven[..., list(group.links)]], axis=-1)
+        return np.concatenate([self.U, self.solution.Q_driven[..., list(self.group.links)]], axis=-1)
+
+    @property
+    def bare_motion(self) -> Motion:
+        """The predicted motion in time, as laws of the gear and of encoders see it."""
+        return Motion(self.group, self.solution, self.par)
+
+    @cached_property
+    def about(self) -> Plane:
+        """The linear arm for small changes about the motion: in the posture that it has, where an encoder that is out
+        of centre tells another one, and with springs to the links."""
+        return _about_motion(self.model, self.bare_motion, self.structure, self.plane)
+
+    @cached_property
+    def added_stiffness(self) -> np.ndarray:
+        """(n,) of effects in parallel with the gears, about the motion, N m/rad."""
+        return _added_stiffness(self.par, self.bare_motion, _of_channel(self.model, "spring"))
+
+    @cached_property
+    def position_slopes(self) -> np.ndarray:
+        """(n,) true position per measured one of encoders that err with it, about the motion."""
+        return _position_slopes(self.bare_motion, _of_channel(self.model, "position"))
 
     @cached_property
     def sampled_impedance(self) -> np.ndarray:
@@ -172,12 +186,13 @@ def predict_at(
         motion = Motion(group, solution, par, delivered=given, told=along)
         at_motors = plane.record[:, None] * motor_torques(par, motion, motor)
         solution = replace(solution, U=solution.U + at_motors)
-    motion = Motion(group, solution, par)
-    U = through_drives(drives, motion)
-    added = _added_stiffness(par, motion, by_channel.get("spring", []))
-    about = _about_motion(model, motion, structure, plane)
-    slopes = _position_slopes(motion, by_channel.get("position", []))
-    return Prediction(model, sampling, structure, par, plane, about, solution, U, added, slopes)
+    U = through_drives(drives, Motion(group, solution, par))
+    return Prediction(model, group, sampling, structure, par, plane, solution, U)
+
+
+def _of_channel(model: Model, channel: str) -> list[Effect]:
+    """Effects of a model that act there."""
+    return [e for e in model.effects if e.hypothesis.channel == channel]
 
 
 def through_drives(effects: Sequence[Effect], motion: Motion) -> np.ndarray:

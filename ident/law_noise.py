@@ -31,12 +31,12 @@ def law_noise(pred: Prediction, group: Group) -> np.ndarray:
         return out
     rng = np.random.default_rng(0)
     draw = rng.normal(size=(2, *pred.U.shape)) * np.sqrt(0.5 * group.shown_error)
-    seen = pred.motion(group)
+    seen = pred.motion()
     motions = replace(seen, error=draw[0] + 1j * draw[1]), seen
     for effect in at_motor:
         j = effect.hypothesis.joint
         off, as_seen = (effect.hypothesis.law(effect.p, x, j, pred.par.stiffness[j]) for x in motions)
-        change = pred.plane.record * pred.motion(group).lines(off - as_seen)
+        change = pred.plane.record * pred.motion().lines(off - as_seen)
         out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
     return out
 

@@ -100,7 +100,7 @@ def _equations(group: Group, pred: Prediction, j: int, delay: float) -> np.ndarr
 
     (S, K - 1, 4) complex, rad; the mean position is left out.
     """
-    motion, s = pred.motion(group), 1j * group.omega
+    motion, s = pred.motion(), 1j * group.omega
     late = np.exp(-s * delay)
     q_link = late * pred.solution.Q_a[..., pred.structure.driven[j]]
     columns = [

@@ -94,7 +94,7 @@ def _loudest(problem: Problem, predictions: Sequence[Prediction], joint: int) ->
     """The records of every group in which most of a joint's torque is unexplained."""
     each, out = max(2, PERIODOGRAM_RECORDS // len(problem.groups)), []
     for group, pred in zip(problem.groups, predictions, strict=True):
-        motion = pred.motion(group)
+        motion = pred.motion()
         R = (group.U - pred.U)[..., joint : joint + 1].copy()
         R[:, group.n_compared :] = 0.0
         signals = (motion.q(joint), motion.v(joint), motion.acceleration(joint), group.to_time(R)[..., 0])

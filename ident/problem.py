@@ -78,7 +78,7 @@ def residual(group: Group, prediction: Prediction) -> np.ndarray:
 
 def output_error(group: Group, prediction: Prediction) -> np.ndarray:
     """The same of all outputs; (S, K, n + M) complex, N m and rad."""
-    return group.observe_outputs(group.outputs - prediction.outputs(group))
+    return group.observe_outputs(group.outputs - prediction.outputs())
 
 
 def data_counts(problem: Problem) -> np.ndarray:

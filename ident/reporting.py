@@ -166,12 +166,12 @@ def evidence_plot(
     by_link = h.channel == "spring" and all(j in group.links for group in problem.groups)
     xs, ys, ms = [], [], []
     for group, pred, without in zip(problem.groups, predictions, bare, strict=True):
-        motion = pred.motion(group)
+        motion = pred.motion()
         band = slice(group.n_compared, None)
         curves = []
         row = n + group.links.index(j) if by_link else j
-        for outputs in (group.outputs, pred.outputs(group)):
-            X = (outputs - without.outputs(group))[..., row : row + 1]
+        for outputs in (group.outputs, pred.outputs()):
+            X = (outputs - without.outputs())[..., row : row + 1]
             X[:, band] = 0.0
             curves.append(group.to_time(X)[..., 0])
         variable = {
@@ -233,7 +233,7 @@ def describe(problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> s
     for name in ("v", "q", "delta", "torque"):
         top = []
         for group, pred in zip(problem.groups, predictions, strict=True):
-            motion = pred.motion(group)
+            motion = pred.motion()
             r = group.to_time((group.U - pred.U)[..., j : j + 1])[..., 0].ravel()
             x = {"v": motion.v, "q": motion.q, "delta": motion.delta, "torque": motion.torque}[name](j).ravel()
             bins = np.digitize(x, np.quantile(x, np.linspace(0.02, 0.98, 30)))

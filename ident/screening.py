@@ -57,7 +57,7 @@ def signal_scale(
     v, q, delta, torque, res, sizes = [], [], [], [], [], []
     starts, tops = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
-        motion = pred.motion(group)
+        motion = pred.motion()
         v.append(np.mean(motion.v(joint) ** 2))
         x = motion.q(joint)
         q.append(np.mean((x - x.mean(axis=1, keepdims=True)) ** 2))
@@ -144,7 +144,7 @@ class _Stage:
         inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-10, hermitian=True) / np.outer(size, size)
         _, prior = prior_of(problem, fit.model)
         damped = steadied_inverse(H + np.diag(prior), RIDGE)
-        motions = tuple(pred.motion(g) for g, pred in zip(problem.groups, predictions, strict=True))
+        motions = tuple(pred.motion() for g, pred in zip(problem.groups, predictions, strict=True))
         return cls(problem, fit, predictions, motions, residuals, columns, moved, inverse, moment, damped)
 
 
@@ -268,7 +268,7 @@ def _along_motion(stage: _Stage, g: int, channel: str, joint: int, signals: np.n
         of = replace(group, Q=Q)
         return predict(
             stage.fit.model, of, problem.sampling, W=pred.solution.W, steps=1, torques=pred.solution.torques
-        ).outputs(of)
+        ).outputs()
 
     before, out = outputs(group.Q), []
     for X in np.moveaxis(signals, -1, 0):

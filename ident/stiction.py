@@ -25,7 +25,7 @@ def held(pred: Prediction, group: Group) -> np.ndarray | None:
     dry = [e for e in pred.model.effects if is_dry(e)]
     if group.rest is None or not any(np.any(group.rest[..., e.hypothesis.joint]) for e in dry):
         return None
-    motion, out = pred.motion(group), np.zeros_like(group.rest)
+    motion, out = pred.motion(), np.zeros_like(group.rest)
     for effect in dry:
         j, k = effect.hypothesis.joint, pred.par.stiffness[effect.hypothesis.joint]
         seen = beside(pred.model.effects, effect, motion)

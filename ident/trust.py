@@ -137,7 +137,7 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
     except NOT_COMPUTED:
         return False
     noise = max(1.0, weighted_cost(there, after, weights) / float(np.sum(data_counts(there))))
-    changes = (g.observe_outputs(b.outputs(g) - a.outputs(g)) for g, a, b in zip(periodic, before, after, strict=True))
+    changes = (g.observe_outputs(b.outputs() - a.outputs()) for g, a, b in zip(periodic, before, after, strict=True))
     foretold = sum(float(np.sum(np.abs(weights.apply(i, x)) ** 2)) for i, x in enumerate(changes)) / noise
     costs = [float(np.sum(fair_costs(there, x, weights))) for x in (before, after)]
     fall = (costs[0] - costs[1]) / noise
@@ -171,7 +171,7 @@ def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect
         return False
     wave_number, path = effect.value(RIPPLE), 0.0
     for group, pred in zip(problem.groups, predictions, strict=True):
-        speed = np.abs(pred.motion(group).v(effect.hypothesis.joint)) * (group.window > 0.5)
+        speed = np.abs(pred.motion().v(effect.hypothesis.joint)) * (group.window > 0.5)
         slow = wave_number * speed < group.omega[group.n_compared - 1]
         path += float(np.sum(speed[slow])) * group.period_time / speed.shape[1]
     return wave_number * path < FEWEST_PERIODS * 2.0 * np.pi

@@ -125,9 +125,9 @@ def test_the_deflection_along_a_record_is_found_beside_a_strong_damper(rattling,
     group = problem.groups[0]
     assert group.omega[-1] * par.damping[0] > 2.0 * par.stiffness[0]
     model = replace(model, par=par, effects=(Effect(along_record(backlash), np.array([gap, 0.0])),))
-    few = predict(model, group, problem.sampling).outputs(group)[..., 0]
+    few = predict(model, group, problem.sampling).outputs()[..., 0]
     monkeypatch.setattr("ident.reactions.RECORD_STEPS", 200)
-    many = predict(model, group, problem.sampling).outputs(group)[..., 0]
+    many = predict(model, group, problem.sampling).outputs()[..., 0]
     assert np.linalg.norm(few - many) < 0.02 * np.linalg.norm(many)
 
 

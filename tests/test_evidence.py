@@ -309,7 +309,7 @@ def test_what_is_left_is_a_share_of_the_excess_over_noise():
 def test_an_encoder_that_is_off_its_centre_errs_by_the_true_angle(identified):
     _, setup, result = identified
     group = setup.problem.groups[0]
-    motion = predictions(setup.problem, result.model, result.remainders)[0].motion(group)
+    motion = predictions(setup.problem, result.model, result.remainders)[0].motion()
     h, p = encoder_eccentricity(2, "elbow_joint"), np.array([0.03, 0.02])
     error = -group.to_time(h.law(p, motion, 2, 1.0)[..., None])[..., 0]
     true = motion.q(2) - error
@@ -374,17 +374,13 @@ def test_a_unit_response_holds_what_the_arm_does_where_it_comes_to_stand(identif
     preds = predictions(problem, result.model, result.remainders, steps=8)
     moved = predictions(problem, replace(result.model, effects=(Effect(h, p),)), result.remainders, steps=8)
     for group, a, b in zip(problem.groups, preds, moved, strict=True):
-        delta = a.motion(group).delta(h.joint)
+        delta = a.motion().delta(h.joint)
         assert np.all(np.sign(delta) == np.sign(delta[0, 0]))  # the gear stays on one flank
-        X = (
-            value
-            * _lines(a.motion(group), h.screen(a.motion(group), h.joint, a.par.stiffness[h.joint], ()).signals)[..., 0]
-        )
+        X = value * _lines(a.motion(), h.screen(a.motion(), h.joint, a.par.stiffness[h.joint], ()).signals)[..., 0]
         along = _gain(a, h.channel, h.joint) * X[..., None]
         way = moved_by_gears(a) @ _share_of_gears(a, h.channel, h.joint) * X[:, :1, None].real
         held, whole = (
-            np.linalg.norm((x - b.outputs(group) + a.outputs(group))[:, 1 : group.n_compared])
-            for x in (along, along + way)
+            np.linalg.norm((x - b.outputs() + a.outputs())[:, 1 : group.n_compared]) for x in (along, along + way)
         )
         assert whole < 0.1 * held
 
@@ -403,8 +399,7 @@ def test_a_coupling_winds_the_gear_up_by_all_that_its_motor_has_turned(identifie
         (unit,) = h.options["responses"](a.structure, a.par, a.plane, group, a.solution, ())
         way = np.einsum("skoj,sjm->sko", moved_by_gears(a), h.options["winds"](a.plane, a.solution))
         held, whole = (
-            np.linalg.norm((value * x - b.outputs(group) + a.outputs(group))[:, 1 : group.n_compared])
-            for x in (unit, unit + way)
+            np.linalg.norm((value * x - b.outputs() + a.outputs())[:, 1 : group.n_compared]) for x in (unit, unit + way)
         )
         assert whole < 0.2 * held
 
@@ -433,7 +428,7 @@ def test_a_softer_gear_lets_the_arm_sag_in_the_columns_of_the_drives(identified,
     before, after = (predictions(problem, m, result.remainders, steps=8) for m in models)
     stage = _Stage.build(problem, result, before)
     for g, (group, a, b) in enumerate(zip(problem.groups, before, after, strict=True)):
-        exact = result.weights.apply(g, group.observe_outputs(b.outputs(group) - a.outputs(group))) / np.log1p(step)
+        exact = result.weights.apply(g, group.observe_outputs(b.outputs() - a.outputs())) / np.log1p(step)
         sag = stage.moved[g][..., j] * a.par.stiffness[j] * a.solution.delta[:, 0, j, None, None].real
         lacking = exact - (stage.columns[g][..., j] - sag)
         share = np.sum((sag.conj() * lacking)[:, 1:]).real / np.sum(np.abs(sag[:, 1:]) ** 2)
@@ -1447,8 +1442,8 @@ def test_signals_of_a_motion_are_made_once_but_for_one_whose_position_is_taken_o
     """Of the other the noise of laws is told: with the signals of the motion as it is there would be none."""
     _, setup, result = identified
     group, pred = setup.problem.groups[0], predictions(setup.problem, result.model, result.remainders)[0]
-    motion = pred.motion(group)
-    assert pred.motion(group).v(2) is motion.v(2) and motion.q(2) is not motion.q(3)
+    motion = pred.motion()
+    assert pred.motion().v(2) is motion.v(2) and motion.q(2) is not motion.q(3)
     off = np.zeros_like(group.Q)
     off[:, 1, 2] = 0.1
     moved = replace(motion, error=off)

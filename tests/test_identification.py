@@ -223,8 +223,8 @@ def test_links_behind_gears_are_found_beside_elastic_hinges(tmp_path):
     problem = set_up(through_files(data, tmp_path)).problem
     result = fit(problem, Model(problem.structure, problem.nominal))
     preds = predictions(problem, result.model, result.remainders)
-    for group, pred in zip(problem.groups, preds, strict=True):
-        motion = pred.motion(group)
+    for pred in preds:
+        motion = pred.motion()
         for j in range(irb.n):
             assert motion.q_link(j) == pytest.approx(motion.q(j) - motion.delta(j), abs=1e-4)
     best = screen(problem, result, preds, [h for h in catalogue(problem.structure) if h.effect == "gravity_spring"])[0]

@@ -104,7 +104,7 @@ def test_links_move_with_the_drives_as_the_jacobian_says(still):
             moved = x.copy()
             moved[i] += sign * 1e-4
             there = predictions(problem, unpack(model, moved, np.inf), [p.solution.W for p in preds])
-            ends.append(there[0].outputs(group)[..., n:])
+            ends.append(there[0].outputs()[..., n:])
         slope = (ends[0] - ends[1]) / 2e-4
         assert np.linalg.norm(J[..., i] - slope) < 1e-2 * np.linalg.norm(slope)
     assert not np.any(J[..., 2 * n : 4 * n]), "motors do not move the links along a given motion"

@@ -45,7 +45,7 @@ def moving(ur10):
 def anew(problem, model, near):
     """Outputs with the geometric remainder made anew."""
     (pred,) = predictions(problem, model, [near.solution.W], steps=REMAINDER_STEPS)
-    return pred.outputs(problem.groups[0])
+    return pred.outputs()
 
 
 def test_softer_gears_move_gravity_and_inertia(moving):

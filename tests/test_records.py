@@ -142,7 +142,7 @@ def test_friction_that_drifts_balances_at_rest_what_is_asked_of_it(monkeypatch):
     problem, (group,) = setup.problem, setup.problem.groups
     h = next(h for h in catalogue(problem.structure) if h.effect == "friction_drift")
     p = np.array([0.5, 5.0, 0.8, 1e-3])
-    motion = predict(Model(problem.structure, problem.nominal, (Effect(h, p),)), group, problem.sampling).motion(group)
+    motion = predict(Model(problem.structure, problem.nominal, (Effect(h, p),)), group, problem.sampling).motion()
     rest, size = group.rest[0, :, 0], 0.8 * (1.0 + 0.5 * (1.0 - np.exp(-motion.time / 5.0)))
     drag = 0.5 * (1.0 - np.exp(-motion.time / 5.0)) * problem.nominal.viscous[0] * motion.v(0)
     held = np.clip(motion.asked(0), -size, size) + drag
@@ -195,7 +195,7 @@ def test_limits_of_the_torque_are_sought_below_what_was_recorded():
     data = Dataset("cut", bench, fs, bench.joint_names, "zoh", np.array([1e-6]), np.array([1e-3]), None, (segment,))
     setup = set_up(data)
     (group,) = setup.problem.groups
-    motion = predict(Model(setup.problem.structure, setup.problem.nominal), group, setup.problem.sampling).motion(group)
+    motion = predict(Model(setup.problem.structure, setup.problem.nominal), group, setup.problem.sampling).motion()
     assert np.abs(motion.torque(0)).max() > 1.5 * 3.0
     assert motion.peak_torque(0) == pytest.approx(3.0, rel=0.05)
 
@@ -253,7 +253,7 @@ def test_what_that_leaves_in_a_friction_is_what_is_said(smoothing):
     (friction,) = [h for h in catalogue(problem.structure) if h.effect == "coulomb_friction"]
     effect = Effect(friction, np.array([1.0, 0.0, smoothing]))
     seen = predict(Model(problem.structure, problem.nominal, (effect,)), group, problem.sampling)
-    motion = seen.motion(group)
+    motion = seen.motion()
     exact = replace(motion, error=truth - group.signal_share * seen.solution.Q)
     off = motion.lines(friction.law(effect.p, motion, 0, 0.0) - friction.law(effect.p, exact, 0, 0.0))
     assert np.mean(law_noise(seen, group)) / np.mean(np.abs(off) ** 2) == pytest.approx(1.0, abs=0.3)

@@ -76,7 +76,7 @@ def test_a_ripple_that_grows_with_the_torque_is_asked_for_in_advance(identified)
     problem, j = setup.problem, 2
     h = next(h for h in catalogue(problem.structure) if h.key == ("unknown:torque_ripple", "elbow_joint"))
     group = problem.groups[0]
-    motion = predictions(problem, result.model, result.remainders)[0].motion(group)
+    motion = predictions(problem, result.model, result.remainders)[0].motion()
     U, k, p = motion.solution.U[..., j], result.model.par.stiffness[j], np.array([0.03, 100.0, 0.02])
 
     def told(part):

@@ -272,7 +272,7 @@ def test_rest_tells_nothing_of_a_friction_within_the_noise_of_what_is_asked():
     """Else the friction of a motor that hardly moves would explain the noise of its torque, whatever its size."""
     problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
     group = problem.groups[0]
-    noise = predict(model, group, problem.sampling).motion(group).asked_noise(0)
+    noise = predict(model, group, problem.sampling).motion().asked_noise(0)
     assert NOISE[1] / 5 < noise < 0.2 * COULOMB
     still = []
     for size in (1.0, 6.0):
