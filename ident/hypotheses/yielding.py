@@ -55,15 +55,18 @@ def along_path(steps: np.ndarray, stiffness: float, limit: float, exponent: floa
 def onward(
     steps: np.ndarray, stiffness: float, limit: float, exponent: float, recoil: float, start: np.ndarray
 ) -> np.ndarray:
-    """Torque (S, T) of an element that yields along steps from a torque ``start`` (S,)."""
+    """Torque (S, T) of an element that yields along steps from a torque ``start`` (S,).
+
+    Records go side by side: a step waits for the one before it of its own record alone.
+    """
     S, T = steps.shape
-    out = np.empty((S, T))
-    for i in range(S):
-        h = start[i]
-        for t in range(T):
-            h, _slope = yielded(stiffness, limit, exponent, recoil, h, steps[i, t])
-            out[i, t] = h
-    return out
+    ahead, h = np.ascontiguousarray(steps.T), start.copy()
+    out = np.empty((T, S))
+    for t in range(T):
+        for i in range(S):
+            h[i], _slope = yielded(stiffness, limit, exponent, recoil, h[i], ahead[t, i])
+            out[t, i] = h[i]
+    return np.ascontiguousarray(out.T)
 
 
 @njit(cache=True, nogil=True)
@@ -79,7 +82,10 @@ def yielded(k: float, limit: float, n: float, recoil: float, h: float, dx: float
 @njit(cache=True, nogil=True)
 def _power(h: float, limit: float, n: float) -> float:
     """``w^n``; nothing of a Maxwell slip, which does not ask for it."""
-    return 0.0 if n >= SLIP else (abs(h) / limit) ** n
+    if n >= SLIP:
+        return 0.0
+    w = abs(h) / limit
+    return w if n == DAHL else w**n
 
 
 @njit(cache=True, nogil=True)
