@@ -65,15 +65,19 @@ def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
     hypothesis leads back. With an error relative to the torque added to the noise the baseline
     stays near, and hypotheses can be compared.
     """
-    stages, ladder = current.softer, ANNEALING[:-1]
-    if not stages:
-        start = replace(current.model, par=problem.nominal)
-        last = anneal(problem, start, ladder=ladder)
-        stages = (*last.softer, last)
+    stages = softened(problem, current)
     kept = 1
     while kept < len(stages) and stages[kept].chi2_per_dof <= STRONG:
         kept += 1
-    return stages[kept - 1], ladder[kept - 1]
+    return stages[kept - 1], ANNEALING[kept - 1]
+
+
+def softened(problem: Problem, current: Fit) -> tuple[Fit, ...]:
+    """The model fitted from the starting guesses of the drives under each of the softened weights of ``ANNEALING``."""
+    if current.softer:
+        return current.softer
+    last = anneal(problem, replace(current.model, par=problem.nominal), ladder=ANNEALING[:-1])
+    return (*last.softer, last)
 
 
 def worth_a_refit(current: Fit) -> float:
@@ -159,6 +163,8 @@ def under_noise_of_best(
 
     near = sum(r.cost - r.count <= NEAR * max(top.cost - top.count, 0.0) for _, r in ranked)
     last = min(max(near, FINALISTS), HOPEFUL)
+    if before.chi2_per_dof > FAINT and top.cost - top.count > (1.0 - WORTH_A_REFIT) * (before.cost - before.count):
+        last = 0  # far from an answer in any noise
     fits = workers.map(moved, ranked[:last])
     again = [*fits, *[None] * len(ranked[last:])]
     weighed = [

@@ -28,9 +28,10 @@ from ident.refits import (
     under_own_noise,
 )
 from ident.screening import Score, signal_scale
-from ident.search import under_noise_of_best
+from ident.search import softened, under_noise_of_best
 from ident.torque_fit import ANNEALING, Fit, anneal
 
+SOFTLY = ANNEALING[1:-1]  # errors added to the noise, relative, under which a strong effect is sought first
 STRONG_STEPS = 10  # at most, of a strong effect under each of the softened weights
 RECOVERIES = 2  # at most, of gears gone astray beside one
 RENEWALS = 3  # at most, of the noise of a law along the record under which its size is found
@@ -38,6 +39,7 @@ STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit 
 # chi2 of a loop over that along the record, each in its own noise, from which it is in another motion
 OTHER_MOTION = 10.0
 CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
+HARDLY_LESS = 0.9  # of what is left without a strong effect under softened weights, for that to explain anything
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 
 
@@ -62,20 +64,16 @@ def beside_strong(
         quiet: joints at which none is sought.
     """
 
-    until_late = workers.until_late
+    annealed = partial(anneal, problem, iterations=STRONG_STEPS, gap=STRONG_GAP, progress=workers.until_late)
 
-    def annealed(score: Score) -> Fit | None:
+    def found(score: Score) -> Fit | None:
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                first = anneal(
-                    problem,
-                    start,
-                    ladder=ANNEALING[1:],
-                    iterations=STRONG_STEPS,
-                    gap=STRONG_GAP,
-                    progress=until_late,
-                )
+                first = annealed(start, ladder=SOFTLY)
+                if not shows_softly((*first.softer, first), without, score.hypothesis.joint):
+                    return None
+                first = annealed(first.model, ladder=ANNEALING[-1:], remainders=first.remainders)
                 last = recovered(problem, first)
                 return either_turn(problem, last, last.model.effects[-1])
         except NOT_COMPUTED:
@@ -84,19 +82,27 @@ def beside_strong(
     top = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
     likely, key = (top.joint, top.key) if top else (-1, None)
     chosen = strong_effects(problem, before, scores, likely, quiet)
+    without = softened(problem, before)[-len(SOFTLY) :] if chosen else ()
     chosen = [
         replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen
     ]
     pairs: list[tuple[Hypothesis, Fit]] = []
     for here in (True, False):
         some = [s for s in chosen if (s.hypothesis.joint == likely) == here]
-        fits = workers.map_in_time(annealed, some, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
+        fits = workers.map_in_time(found, some, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
         pairs += [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not last_is_pointless(r)]
         if any(h.key == key and settled(r) for h, r in pairs):
             break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
+    # Noise along the record is taken large, and a law that leaves as much as no law does even in that is far off.
     along = sorted(
-        (x for x in pairs if is_along_record(x[0]) and not implausible(problem, x[1], [x[0].joint])),
+        (
+            (h, r)
+            for h, r in pairs
+            if is_along_record(h)
+            and r.costs[h.joint] < before.costs[h.joint]
+            and not implausible(problem, r, [h.joint])
+        ),
         key=lambda x: x[1].cost,
     )
     again = workers.map(lambda x: under_its_noise(problem, x[1]), along[:FINALISTS])
@@ -117,6 +123,19 @@ def beside_strong(
         best.setdefault(h.key, (h, r))
     others = [(h, r) for h, r in ranked if h.key not in best]
     return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+
+
+def shows_softly(stages: Sequence[Fit], without: Sequence[Fit], joint: int) -> bool:
+    """Whether a strong effect explains anything at its own joint under weights that bear with the error of a model, or
+    there is nothing to explain there.
+
+    Args:
+        stages, without: fits with the effect and without, under one of these weights each.
+    """
+    count = without[-1].counts[joint]
+    pairs = [(r.costs[joint] - count, w.costs[joint] - count) for r, w in zip(stages, without, strict=True)]
+    told = [left < HARDLY_LESS * bare for left, bare in pairs if bare > (DETECTION_EXCESS - 1.0) * count]
+    return any(told) or not told
 
 
 def under_its_noise(problem: Problem, result: Fit) -> Fit:
