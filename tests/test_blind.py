@@ -7,6 +7,7 @@ import pytest
 
 from ident.diagnosis import diagnose, diagnose_fully
 from ident.verdict import UNKNOWN
+from robot_assets.robot import load_robot
 from sim import draw_effect
 from sim.effects import parameters_of
 from sim.experiment import draw_drives
@@ -103,6 +104,30 @@ def test_a_torque_constant_that_falls_with_time_gets_no_name(ur10, tmp_path):
     assert verdict.discrepancy.detected
     assert verdict.unexplained_verdict == "unknown cause remains"
     assert all(c.probability <= 0.5 for c in verdict.causes)
+
+
+@pytest.mark.parametrize("clipped", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_motor_whose_iron_saturates_is_not_one_that_is_clipped(tmp_path, clipped):
+    """Asked for up to 1.4 N m, of 1.6 that it may deliver at most; or cut at half of what it is asked for."""
+    from dataclasses import dataclass
+
+    robot = load_robot("twomass")
+
+    @dataclass(frozen=True)
+    class Curve:
+        place: str
+
+        def deliver(self, run):
+            return lambda u, step: np.clip(u, -0.8, 0.8) if clipped else 1.6 * np.tanh(u / 1.6)
+
+    data = quick_experiment(
+        small_plan(robot, 3, period=1000, levels=(16.0, 8.0)), [Curve(robot.joint_names[0])], seed=3
+    )
+    verdict = diagnose(through_files(data, tmp_path))
+    named = [c.effect for c in verdict.causes if c.probability > 0.5]
+    assert verdict.discrepancy.detected
+    assert named == (["torque_saturation"] if clipped else [])
+    assert clipped or verdict.unexplained_verdict == "unknown cause remains"
 
 
 @pytest.mark.slow

@@ -62,7 +62,8 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
         out.append(friction.rising_friction(j, name))
         out.append(friction.position_friction(j, name))
         out.append(structure.link_friction(j, name))
-        out += [drifts.torque_drift(j, name), drive.torque_ripple(j, name), sensing.position_scale(j, name)]
+        out += [drifts.torque_drift(j, name), sensing.position_scale(j, name)]
+        out += [drive.torque_ripple(j, name), drive.torque_curve(j, name)]
         if not motions_alone:
             out.append(sensing.constant_torque(j, name))
             if not held:

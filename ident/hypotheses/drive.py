@@ -178,6 +178,38 @@ def torque_saturation(joint: int, place: str, wound_up: bool = False) -> Hypothe
     )
 
 
+def torque_curve(joint: int, place: str) -> Hypothesis:
+    """Decoy: a motor whose iron saturates, ``reach tanh(u / reach)`` of a recorded torque ``u`` that stays below the
+    reach.
+
+    It falls short at every torque, where one that is clipped does at its peaks alone.
+    """
+
+    def excess(p, motion: Motion, j: int) -> np.ndarray:
+        u, reach = motion.torque(j), max(p[0], motion.peak_torque(j))
+        return u - reach * np.tanh(u / reach)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        u, peak = motion.torque(j), motion.peak_torque(j)
+        # what ``tanh`` lacks to third order, of a reach as large as the peak
+        return Screen(
+            (u**3 / (3.0 * peak**2),), lambda c: np.array([peak / np.sqrt(min(c[0], 1.0))]) if c[0] > 0 else None
+        )
+
+    return Hypothesis(
+        "unknown:torque_curve",
+        place,
+        joint,
+        "drive",
+        (Parameter("reach", "N m", 1e-6, 1e9, log=True, step=1e-3),),
+        lambda p, motion, j, k, U: U + motion.lines(excess(p, motion, j)),
+        lambda scale: [()],
+        screen,
+        "The motor of {joint} delivers less of a torque the larger that is, at torques of any size.",
+        variable="torque",
+    )
+
+
 def cogging(joint: int, place: str, wave_number: float | None = None) -> Hypothesis:
     """``amplitude sin(periods_per_rev q + phase)`` that drives the motor, as MuJoCo's own element does, with a second
     harmonic."""
