@@ -788,7 +788,9 @@ def test_an_effect_at_its_bounds_is_none(named):
     soft = named["softening_stiffness", "elbow_joint"]  # as soft as a dead band, it is one
     assert [pointless(Effect(soft, np.array([share * 1e4, 1e-4])), 1e4) for share in (0.02, 0.3)] == [True, False]
     dip = named["stribeck_friction", "elbow_joint"]  # of a friction that vanishes in motion there is none
-    falls = [pointless(Effect(dip, np.array([coulomb, 1.0, 0.05, 1e-3])), 1e4) for coulomb in (0.95, 0.5, 0.15, 0.01)]
+    falls = [
+        pointless(Effect(dip, np.array([coulomb, 1.0, 0.05, 1e-3, 2.0])), 1e4) for coulomb in (0.95, 0.5, 0.15, 0.01)
+    ]
     assert falls == [True, False, False, True]
 
 
@@ -1372,7 +1374,7 @@ def test_plain_friction_widens_to_laws_that_hold_it(named):
         scale = SimpleNamespace(v=0.1, q=0.02)
         for p in h.options["widens"](np.array([size, 0.1, 1e-3]), scale):
             assert len(p) == len(h.parameters) and not pointless(Effect(h, p), 1e4)
-            assert all(q.lower < v < q.upper or v == q.null for q, v in zip(h.parameters, p, strict=True))
+            assert all(q.lower < v < q.upper or v in (q.null, q.center) for q, v in zip(h.parameters, p, strict=True))
             special = h.options["special"](p)
             assert 0.5 * size < special[0] < 2.0 * size
 

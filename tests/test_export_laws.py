@@ -3,8 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ident.hypotheses.yielding import along_path, bristle, elastoplastic
+from ident.show.dips import square_dips
 from ident.show.export import build_mjcf
 from robot_assets.robot import load_robot
 from tests.test_show import cause, parameters
@@ -87,12 +90,23 @@ def test_the_bending_of_a_bristle_is_damped(bench):
     assert np.abs(law - z).max() > 0.3 * 0.3
 
 
-def test_stribeck_friction_falls_with_velocity(bench):
-    model, data = exported(bench, cause("stribeck_friction", JOINT, coulomb=0.2, static=0.5, stribeck_velocity=0.1))
+@pytest.mark.parametrize("exponent", [2.0, 1.0, 0.7])
+def test_stribeck_friction_falls_with_velocity(bench, exponent):
+    dip = cause("stribeck_friction", JOINT, coulomb=0.2, static=0.5, stribeck_velocity=0.1, exponent=exponent)
+    model, data = exported(bench, dip)
     t, q, v = swing(model, 0.05, 1.0)
-    law = np.sign(v) * (0.2 + 0.3 * np.exp(-((v / 0.1) ** 2)))
+    law = np.sign(v) * (0.2 + 0.3 * np.exp(-(np.abs(v / 0.1) ** exponent)))
     slides = (np.abs(v) > 0.02) & (t > 1.0)  # beyond the breakaway distance of the bristle
-    assert np.allclose(forced(model, data, q, v)[slides], -law[slides], rtol=2e-3)
+    assert np.allclose(forced(model, data, q, v)[slides], -law[slides], rtol=2e-3 if exponent == 2.0 else 1.5e-2)
+
+
+@given(st.floats(0.5, 2.0))
+def test_falls_by_other_powers_are_mixtures_of_squares(exponent):
+    shares, widths = np.transpose(square_dips(0.3, exponent))
+    v = 0.3 * np.geomspace(0.01, 30.0, 50)
+    mixture = np.exp(-((v[:, None] / widths) ** 2)) @ shares
+    assert np.all(shares > 0.0) and np.sum(shares) == pytest.approx(1.0)
+    assert np.abs(mixture - np.exp(-((v / 0.3) ** exponent))).max() < (0.025 if exponent > 0.7 else 0.07)
 
 
 def test_hysteresis_is_maxwell_slip(bench):

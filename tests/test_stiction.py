@@ -288,7 +288,7 @@ def test_a_law_that_has_lost_what_sets_it_apart_is_its_special_case():
     def special(effect, p):
         return plainly_special(problem, model, Effect(laws[effect], np.array(p)))
 
-    assert [special("stribeck_friction", [2.0, static, 0.01, 1e-3]) for static in (1.7, 2.2, 2.4)] == [
+    assert [special("stribeck_friction", [2.0, static, 0.01, 1e-3, 2.0]) for static in (1.7, 2.2, 2.4)] == [
         True,
         True,
         False,
@@ -302,7 +302,7 @@ def test_a_dip_within_rest_is_none_beside_a_law_along_the_record():
     slow = min(g.least_velocity[:, 0].mean() for g in problem.groups)
     along = replace(model, effects=(Effect(along_record(laws["backlash"]), np.array([1e-3, 0.0])),))
     for width, beside in ((0.5, True), (10.0, False)):
-        dip = Effect(laws["stribeck_friction"], np.array([COULOMB, STATIC, width * slow, 1e-4]))
+        dip = Effect(laws["stribeck_friction"], np.array([COULOMB, STATIC, width * slow, 1e-4, 2.0]))
         assert plainly_special(problem, along, dip) is beside
         assert not plainly_special(problem, model, dip)
 

@@ -26,6 +26,8 @@ SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not 
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
 LEAST_DIP = 1.15  # static friction over Coulomb's, below which it is as good as that
 MOST_DIP = 10.0  # the same, beyond which nothing rubs in motion: no friction of a bearing
+# of the velocity in the fall of a Stribeck friction
+DIP = Parameter("exponent", "1", 0.5, 2.0, log=True, nuisance=True, step=1e-2, center=2.0, spread=0.5, reported=True)
 TURN_SHARE = 2e-3  # velocity within which a friction turns over that of its dip, at first
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
@@ -172,11 +174,11 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
 
 
 def stribeck_friction(joint: int, place: str) -> Hypothesis:
-    """``sign v (coulomb + (static - coulomb) exp(-(v / v_s)^2))`` (Armstrong-Helouvry 1991)."""
+    """``sign v (coulomb + (static - coulomb) exp(-|v / v_s|^exponent))``: the exponent is 2, or 1, or between
+    (Armstrong-Helouvry 1991)."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        v = motion.v(j)
-        size = p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-((v / p[2]) ** 2))
+        size = p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-(np.abs(motion.v(j) / p[2]) ** p[4]))
         return dry(motion, j, p[3], size)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
@@ -187,13 +189,14 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             if c[0] + c[1] <= 0:
                 return None
             coulomb = max(c[0], 0.3 * (c[0] + c[1]))
-            return np.array([coulomb, max(c[0] + c[1], 1.3 * coulomb), shape[0], shape[0] * TURN_SHARE])
+            static = max(c[0] + c[1], 1.3 * coulomb)
+            return np.array([coulomb, static, shape[0], shape[0] * TURN_SHARE, DIP.center])
 
-        return Screen((s, s * np.exp(-((v / shape[0]) ** 2))), start, shape)
+        return Screen((s, s * np.exp(-(np.abs(v / shape[0]) ** DIP.center))), start, shape)
 
     def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
         coulomb = max(old[0] + weights[0], 0.1 * old[0])
-        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[2]])
+        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[2], p[4]])
 
     return Hypothesis(
         "stribeck_friction",
@@ -205,6 +208,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             Parameter("static", "N m", 1e-9, 1e7, log=True),
             Parameter("stribeck_velocity", "rad/s", 1e-6, 1e2, True, step=1e-2, center=0.05, spread=1.2),
             SMOOTHING,
+            DIP,
         ),
         law,
         lambda scale: [(f * scale.v,) for f in (0.05, 0.15, 0.4, 1.0)],
@@ -221,7 +225,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "trivial": lambda p, k: not LEAST_DIP * p[0] < p[1] < MOST_DIP * p[0],
             "plain": lambda p: p[1] < LEAST_DIP * p[0],
             "within": lambda p: p[2],
-            "widens": lambda p, s: [np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2]]) for f in (0.05, 0.3)],
+            "widens": lambda p, s: [np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2], DIP.center]) for f in (0.05, 0.3)],
         },
     )
 

@@ -13,6 +13,7 @@ import tomlkit
 
 from ident.chain import LinkChange, build_structure
 from ident.hypotheses.yielding import DAHL, SLIP
+from ident.show.dips import SQUARE, square_dips
 from ident.show.slips import maxwell_slips
 from ident.units import unit_suffix
 from ident.verdict import Cause, Diagnosis
@@ -230,7 +231,7 @@ def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> 
 
 NATIVE = {
     "coulomb_friction": "frictionloss of motor:{place} and, where it is asymmetric, passive:{index}",
-    "stribeck_friction": "bristle of passive:{index}, as stiff as the time step allows, for the turn of the sign",
+    "stribeck_friction": "bristles passive:{index} ..., as stiff as the time step allows, for the turn of the sign",
     "presliding_friction": "bristle of passive:{index}, or springs friction:{index} which yield",
     "cogging": "cogging of passive:{index}",
     "torque_constant": "gear of drive:{place}",
@@ -332,9 +333,11 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         if bias:
             _add_passive(spec, index, name, cogging=[-bias, 0.0, 0.5 * np.pi])
     elif cause.effect == "stribeck_friction":
-        stiffness = motor.armature * (BRISTLE / step) ** 2
-        static = max(p["static"], p["coulomb"])
-        _add_passive(spec, index, name, lugre=[stiffness, 0.0, p["coulomb"], static, p["stribeck_velocity"]])
+        stiffness, levels = motor.armature * (BRISTLE / step) ** 2, (p["coulomb"], max(p["static"], p["coulomb"]))
+        dips = square_dips(p["stribeck_velocity"], p.get("exponent", SQUARE))
+        for part, (share, velocity) in enumerate(dips):
+            bristle = [share * stiffness, 0.0, *(share * level for level in levels), velocity]
+            _add_passive(spec, f"{index}.{part}" if part else index, name, lugre=bristle)
     elif cause.effect == "presliding_friction":
         if p.get("exponent", DAHL) < MOST_ROUNDED:
             damping = p["stiffness"] * p.get("relaxation", 0.0)
@@ -387,7 +390,7 @@ def _add_friction(joint: mujoco.MjsJoint, torque: float, step: float) -> None:
     joint.solref_friction, joint.solimp_friction = [2.0 * step, 1.0], TIGHT
 
 
-def _add_passive(spec: mujoco.MjSpec, index: int, joint: str, **parts: list[float]) -> None:
+def _add_passive(spec: mujoco.MjSpec, index: int | str, joint: str, **parts: list[float]) -> None:
     """A motor without windings or input: its cogging or its bristle (LuGre) alone acts on the joint.
 
     Cogging of no periods is a constant torque.
