@@ -21,6 +21,7 @@ from ident.evidence import Candidate, last_is_pointless
 from ident.faint import SEEN, hidden
 from ident.hypotheses import Hypothesis, catalogue
 from ident.model import Effect, is_along_record
+from ident.pairs import beside_rivals
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
 from ident.pruning import plainer, plainly_special, pruned, renamed, untold, without_shadows
@@ -57,6 +58,7 @@ DETECTION_LEVEL = 1e-4  # p-value below which there is a discrepancy
 DOUBTED_LEVEL = 1e-2  # the same where the drives that fit cannot be those of this arm
 # share of the discrepancy up to which a decoy explains what laws of causes lack, and belies no name
 LEFT_TO_DECOYS = 0.03
+LEFT_TO_PAIRS = 0.03  # the same, from which two causes are sought at once
 # of what is left at a joint, from which a friction is fitted there too: a step at a few shapes shows half of it
 LINEAR_SHARE = 0.5 * MIN_SHARE
 # of a law of the gear, over that along the record or found so far, from which its loop is begun
@@ -133,7 +135,11 @@ def attribute(
         if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
             found = beside_unclear(problem, current, found, asked, workers, bare)
         if not answers(found, SEEN if faint else MIN_EVIDENCE):
-            break
+            much = not faint and left_share(baseline, current) > LEFT_TO_PAIRS and not workers.late
+            pair = beside_rivals(problem, current, rounds, hypotheses, workers) if much else None
+            if pair is None:
+                break
+            rounds, found = pair
         found = with_name(found)
         best = found.candidates[0]
         rounds.append(found)

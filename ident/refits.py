@@ -80,7 +80,7 @@ def refit(
     problem: Problem,
     model: Model,
     weights: Weights | None,
-    remainders: Sequence[np.ndarray],
+    remainders: Sequence[np.ndarray | None],
     iterations: int = 10,
     most: float = np.inf,
     aim: float = np.inf,

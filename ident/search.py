@@ -35,6 +35,7 @@ from ident.refits import (
     turned,
 )
 from ident.screening import Score, screen, signal_scale
+from ident.thinning import on_few, thinned
 from ident.torque_fit import ANNEALING, Fit, anneal
 from ident.weights import make_weights
 
@@ -115,26 +116,30 @@ def explore_softly(
         what it explains under softened weights: of two causes the sharp ones may see the other one alone.
     """
     stage, level = soften(problem, current)
-    found, scores = explore(problem, stage, hypotheses, 0.0, ANSWERED, workers, rough=True)
+    few = thinned(problem)
+    rough = on_few(few, stage, level)
+    found, scores = explore(few, rough, hypotheses, 0.0, ANSWERED, workers, rough=True)
     # Of laws of which nothing is left but a special case, that one goes on.
     last = best_named([(h, r) for h, r in found if not last_is_pointless(r)], FINALISTS, FINALISTS)
-    softly = {h.key: explained(stage, r, noise=0.0) for h, r in last}
+    softly = {h.key: explained(rough, r, noise=0.0) for h, r in last}
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
-    ways = [(h, r, (*ladder, sharp)) for h, r in last]
-    ways += [(h, r, (sharp,)) for h, r in best_named(direct, FINALISTS, FINALISTS)]
+    unknown = [None] * len(problem.groups)
+    ways = [(h, r.model, unknown, (*ladder, sharp)) for h, r in last]
+    ways += [(h, r.model, r.remainders, (sharp,)) for h, r in best_named(direct, FINALISTS, FINALISTS)]
 
-    def sharpened(way: tuple[Hypothesis, Fit, tuple[Weights, ...]]) -> Fit | None:
-        _, result, steps = way
+    def sharpened(way: tuple[Hypothesis, Model, Sequence[np.ndarray | None], tuple[Weights, ...]]) -> Fit | None:
+        _, model, remainders, steps = way
         last = None
         for weights in steps:
-            last = refit(problem, result.model, weights, result.remainders)
-            result = last or result
+            last = refit(problem, model, weights, remainders)
+            if last is not None:
+                model, remainders = last.model, last.remainders
         return last
 
     fits = workers.map_in_time(sharpened, ways, lambda way: f"finalist: {way[0].effect} at {way[0].place}")
-    finalists = [(h, r) for (h, _, _), r in zip(ways, fits, strict=True) if r is not None]
+    finalists = [(h, r) for (h, *_), r in zip(ways, fits, strict=True) if r is not None]
     return reweighted(problem, current, sharp), finalists, scores, softly
 
 

@@ -29,6 +29,7 @@ from ident.refits import (
 )
 from ident.screening import Score, signal_scale
 from ident.search import softened, under_noise_of_best
+from ident.thinning import thinned
 from ident.torque_fit import ANNEALING, Fit, anneal
 
 SOFTLY = ANNEALING[1:-1]  # errors added to the noise, relative, under which a strong effect is sought first
@@ -39,6 +40,7 @@ STRONG_GAP = 0.01  # relative fall of the cost in a step below which such a fit 
 # chi2 of a loop over that along the record, each in its own noise, from which it is in another motion
 OTHER_MOTION = 10.0
 CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
+FAR_BEHIND = 1.5  # cost at its joint of a law along the record over that of the best candidate, beyond which it is out
 HARDLY_LESS = 0.9  # of what is left without a strong effect under softened weights, for that to explain anything
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 
@@ -64,16 +66,17 @@ def beside_strong(
         quiet: joints at which none is sought.
     """
 
-    annealed = partial(anneal, problem, iterations=STRONG_STEPS, gap=STRONG_GAP, progress=workers.until_late)
+    annealed = partial(anneal, iterations=STRONG_STEPS, gap=STRONG_GAP, progress=workers.until_late)
 
     def found(score: Score) -> Fit | None:
         start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
-                first = annealed(start, ladder=SOFTLY)
+                first = annealed(few, start, ladder=SOFTLY)
                 if not shows_softly((*first.softer, first), without, score.hypothesis.joint):
                     return None
-                first = annealed(first.model, ladder=ANNEALING[-1:], remainders=first.remainders)
+                there = first.remainders if few is problem else None
+                first = annealed(problem, first.model, ladder=ANNEALING[-1:], remainders=there)
                 last = recovered(problem, first)
                 return either_turn(problem, last, last.model.effects[-1])
         except NOT_COMPUTED:
@@ -82,7 +85,9 @@ def beside_strong(
     top = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
     likely, key = (top.joint, top.key) if top else (-1, None)
     chosen = strong_effects(problem, before, scores, likely, quiet)
-    without = softened(problem, before)[-len(SOFTLY) :] if chosen else ()
+    few = thinned(problem)
+    known = before if few is problem else replace(before, softer=())
+    without = softened(few, known)[-len(SOFTLY) :] if chosen else ()
     chosen = [
         replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen
     ]
@@ -94,14 +99,16 @@ def beside_strong(
         if any(h.key == key and settled(r) for h, r in pairs):
             break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
-    # Noise along the record is taken large, and a law that leaves as much as no law does even in that is far off.
+    # Noise along the record is taken large: a law that leaves as much even in that as no law, or clearly more than the
+    # best, is far off.
+    allowed = before.costs
+    if ranked:
+        allowed = np.minimum(allowed, FAR_BEHIND * min(ranked, key=lambda x: x[1].cost)[1].costs)
     along = sorted(
         (
             (h, r)
             for h, r in pairs
-            if is_along_record(h)
-            and r.costs[h.joint] < before.costs[h.joint]
-            and not implausible(problem, r, [h.joint])
+            if is_along_record(h) and r.costs[h.joint] < allowed[h.joint] and not implausible(problem, r, [h.joint])
         ),
         key=lambda x: x[1].cost,
     )

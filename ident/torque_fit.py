@@ -124,7 +124,7 @@ def anneal(
     ladder: Sequence[float] = ANNEALING,
     iterations: int = 12,
     gap: float = GAP,
-    remainders: Sequence[np.ndarray] | None = None,
+    remainders: Sequence[np.ndarray | None] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Fits under less and less error added to the noise (``ladder``), each from where the last one ended.
@@ -161,7 +161,7 @@ def fit(
     iterations: int = 12,
     gap: float = GAP,
     weights: Weights | None = None,
-    remainders: Sequence[np.ndarray] | None = None,
+    remainders: Sequence[np.ndarray | None] | None = None,
     most: float = np.inf,
     aim: float = np.inf,
     exact: bool = False,
