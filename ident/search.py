@@ -117,7 +117,7 @@ def explore_softly(
     """
     stage, level = soften(problem, current)
     few = thinned(problem)
-    rough = on_few(few, stage, level)
+    rough = stage if few is problem else on_few(few, stage, level)
     found, scores = explore(few, rough, hypotheses, 0.0, ANSWERED, workers, rough=True)
     # Of laws of which nothing is left but a special case, that one goes on.
     last = best_named([(h, r) for h, r in found if not last_is_pointless(r)], FINALISTS, FINALISTS)
@@ -125,8 +125,8 @@ def explore_softly(
     preds = predictions(problem, stage.model, stage.remainders)
     sharp = make_weights(problem, preds, 0.0)
     ladder = [make_weights(problem, preds, rho) for rho in ANNEALING if 0 < rho < level]
-    unknown = [None] * len(problem.groups)
-    ways = [(h, r.model, unknown, (*ladder, sharp)) for h, r in last]
+    cold = None if few is problem else [None] * len(problem.groups)
+    ways = [(h, r.model, cold or r.remainders, (*ladder, sharp)) for h, r in last]
     ways += [(h, r.model, r.remainders, (sharp,)) for h, r in best_named(direct, FINALISTS, FINALISTS)]
 
     def sharpened(way: tuple[Hypothesis, Model, Sequence[np.ndarray | None], tuple[Weights, ...]]) -> Fit | None:

@@ -1,6 +1,7 @@
 """Two causes at once, and a few records that stand for all."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from ident.pairs import beside_rivals
 from ident.parallel import Workers
 from ident.problem import data_counts
 from ident.rounds import answers, weighed_round
+from ident.strong import shows_softly
 from ident.thinning import ENOUGH, on_few, thinned
 from ident.torque_fit import fit
 from sim import parse_effect
@@ -83,3 +85,22 @@ def test_axes_that_are_excited_alone_keep_their_records(identified):
     rows = np.tile(np.arange(6), 3)
     posture = replace(problem, groups=(problem.groups[0].pick(rows),))
     assert thinned(posture) is posture
+
+
+@pytest.mark.parametrize(
+    ("without", "beside", "shows"),
+    [
+        ((2.0, 10.0), (2.0, 9.5), False),
+        ((2.0, 10.0), (2.0, 5.0), True),
+        ((2.0, 10.0), (1.2, 12.0), True),  # under weights that bear with more of it
+        ((0.3, 10.0), (0.2, 9.5), False),  # where these bear with all of it they tell nothing
+        ((0.3, 0.5), (0.3, 0.5), True),  # nor do any: no reason to give up
+    ],
+)
+def test_strong_effects_go_on_where_softened_weights_see_them(without, beside, shows):
+    """Costs over counts at the joint under two softened weights, without a strong effect and beside it."""
+    stages, bare = (
+        [SimpleNamespace(costs=np.array([100.0 * x]), counts=np.array([100.0])) for x in costs]
+        for costs in (beside, without)
+    )
+    assert shows_softly(stages, bare, 0) is shows
