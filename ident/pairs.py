@@ -20,14 +20,16 @@ from ident.search import begin, best_named
 from ident.torque_fit import Fit
 
 SECONDS = 2  # causes that are tried beside each rival
-PAIR_LEAVES = 0.1  # of the excess over noise, at most, for two causes at once to be named
+# of the excess over noise that the cause named last leaves: what a linear step may leave for a pair to be tried, and
+# what the pair may leave at most
+PROMISED, PAIR_LEAVES = 0.5, 0.1
 
 
 def beside_rivals(
     problem: Problem, current: Fit, rounds: Sequence[Round], hypotheses: Sequence[Hypothesis], workers: Workers
 ) -> tuple[list[Round], Round] | None:
-    """The rounds with a rival of the cause that was named last in its place, and one in which a second cause beside it
-    explains nearly all that is left; None where there are none such.
+    """The rounds with a rival of the cause that was named last in its place, and one in which a second cause at its
+    joint explains nearly all that is left beside it; None where there are none such.
 
     Args:
         current: the model with the cause that was named last, beside which nothing answers.
@@ -41,13 +43,15 @@ def beside_rivals(
         (c.hypothesis, c) for c in last.candidates[1:] if not c.hypothesis.decoy and c.hypothesis.key != winner.key
     ]
     rivals = [c for _, c in best_named(named, FINALISTS, 0)]
-    allowed = PAIR_LEAVES * (current.cost - current.count)
+    excess = current.cost - current.count
+    allowed = PAIR_LEAVES * excess
 
     def seconds(stage: Fit) -> list[Score]:
         taken = {e.hypothesis.key for e in stage.model.effects}
-        free = [h for h in hypotheses if not h.decoy and h.key not in taken]
+        free = [h for h in hypotheses if h.joint == winner.joint and not h.decoy and h.key not in taken]
         scores = screen(problem, stage, predictions(problem, stage.model, stage.remainders), free)
-        return [s for s in scores if s.start is not None and s.gain > 0.0][:SECONDS]
+        hopeful = [s for s in scores if stage.cost - s.gain - current.count <= PROMISED * excess]
+        return [s for s in hopeful if s.start is not None][:SECONDS]
 
     def paired(of: tuple[Fit, Score]) -> Fit | None:
         stage, score = of
