@@ -73,7 +73,7 @@ def beside_strong(
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
                 first = annealed(few, start, ladder=SOFTLY)
-                if not shows_softly((*first.softer, first), without, score.hypothesis.joint):
+                if without and not shows_softly((*first.softer, first), without, score.hypothesis.joint):
                     return None
                 there = first.remainders if few is problem else None
                 first = annealed(problem, first.model, ladder=ANNEALING[-1:], remainders=there)
@@ -86,8 +86,7 @@ def beside_strong(
     likely, key = (top.joint, top.key) if top else (-1, None)
     chosen = strong_effects(problem, before, scores, likely, quiet)
     few = thinned(problem)
-    known = before if few is problem else replace(before, softer=())
-    without = softened(few, known)[-len(SOFTLY) :] if chosen else ()
+    without = without_strong(few, before if few is problem else replace(before, softer=())) if chosen else ()
     chosen = [
         replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen
     ]
@@ -130,6 +129,16 @@ def beside_strong(
         best.setdefault(h.key, (h, r))
     others = [(h, r) for h, r in ranked if h.key not in best]
     return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+
+
+def without_strong(problem: Problem, current: Fit) -> tuple[Fit, ...]:
+    """The model as it is under the weights under which strong effects are sought; none where that cannot be computed
+    from the starting guesses of the drives."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
+            return softened(problem, current)[-len(SOFTLY) :]
+    except NOT_COMPUTED:
+        return ()
 
 
 def shows_softly(stages: Sequence[Fit], without: Sequence[Fit], joint: int) -> bool:

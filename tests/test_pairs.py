@@ -13,7 +13,7 @@ from ident.pairs import beside_rivals
 from ident.parallel import Workers
 from ident.problem import data_counts
 from ident.rounds import answers, weighed_round
-from ident.strong import shows_softly
+from ident.strong import shows_softly, without_strong
 from ident.thinning import ENOUGH, on_few, thinned
 from ident.torque_fit import fit
 from sim import parse_effect
@@ -104,3 +104,9 @@ def test_strong_effects_go_on_where_softened_weights_see_them(without, beside, s
         for costs in (beside, without)
     )
     assert shows_softly(stages, bare, 0) is shows
+
+
+def test_a_model_that_cannot_be_computed_from_the_guesses_has_none_to_compare_with(identified):
+    _, setup, result = identified
+    guesses = replace(setup.problem.nominal, stiffness=np.full(6, np.nan))
+    assert without_strong(replace(setup.problem, nominal=guesses), replace(result, softer=())) == ()
