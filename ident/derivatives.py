@@ -11,7 +11,7 @@ import numpy as np
 from ident.columns import Columns, Products
 from ident.coordinates import coordinate_names, effect_steps, moves_geometry, moves_links, pack, shifts_posture, unpack
 from ident.errors_in_variables import impedance_slopes, scatter_information, scatter_slope
-from ident.extended import Prediction, predict, predict_at, through_drives
+from ident.extended import Prediction, of_channel, predict, predict_at, through_drives
 from ident.group import Group
 from ident.inverse import Plane, baseline_products
 from ident.model import Effect, Model, joints_along_record
@@ -153,7 +153,7 @@ def _differences(
 
 def _passed_on(columns: Columns, model: Model, pred: Prediction) -> dict[int, np.ndarray]:
     """Baseline columns of the torque that drives with effects pass on; none where there are no such drives."""
-    drives = _drives(model)
+    drives = of_channel(model, "drive")
     if not drives:
         return {}
     dense = columns.dense()
@@ -164,11 +164,6 @@ def _passed_on(columns: Columns, model: Model, pred: Prediction) -> dict[int, np
         passed = _change_passed(effect, motion, full)
         dense[:, :, j] = np.moveaxis(passed[:, :, : dense.shape[1]], 0, -1)
     return dict(enumerate(np.moveaxis(dense, -1, 0)))
-
-
-def _drives(model: Model) -> list[Effect]:
-    """Effects of the drives, in the order in which they act."""
-    return [e for e in model.effects if e.hypothesis.channel == "drive"]
 
 
 def _change_passed(drive: Effect, motion: Motion, X: np.ndarray) -> np.ndarray:
@@ -240,7 +235,7 @@ def _motor_columns(
     motion = beside(model.effects, effect, pred.motion())
     k = pred.par.stiffness[j]
     now, columns = h.law(effect.p, motion, j, k), []
-    drives = [e for e in _drives(model) if e.hypothesis.joint == j]
+    drives = [e for e in of_channel(model, "drive") if e.hypothesis.joint == j]
     for p, step in steps:
         X = pred.plane.record * motion.lines(h.law(p, motion, j, k) - now)
         for drive in drives:
@@ -256,7 +251,7 @@ def _drive_columns(
 ) -> list[np.ndarray]:
     """Derivatives by a drive with an effect: what it is given does not change."""
     motion, n, columns = pred.motion(), model.structure.n, []
-    drives = _drives(model)
+    drives = of_channel(model, "drive")
     for p, step in steps:
         out = np.zeros((*pred.U.shape[:2], n + len(group.links)), complex)
         out[..., :n] = through_drives([replace(e, p=p) if e is effect else e for e in drives], motion) - pred.U

@@ -40,7 +40,7 @@ class Prediction:
 
     def motion(self) -> Motion:
         """The predicted motion in time, with the torque that its drives deliver."""
-        given = delivered(_of_channel(self.model, "drive"), self.group, self.plane)
+        given = delivered(of_channel(self.model, "drive"), self.group, self.plane)
         return replace(self.bare_motion, delivered=given, told=joints_along_record(self.model, self.group))
 
     def outputs(self) -> np.ndarray:
@@ -63,12 +63,12 @@ class Prediction:
     @cached_property
     def added_stiffness(self) -> np.ndarray:
         """(n,) of effects in parallel with the gears, about the motion, N m/rad."""
-        return _added_stiffness(self.par, self.bare_motion, _of_channel(self.model, "spring"))
+        return _added_stiffness(self.par, self.bare_motion, of_channel(self.model, "spring"))
 
     @cached_property
     def position_slopes(self) -> np.ndarray:
         """(n,) true position per measured one of encoders that err with it, about the motion."""
-        return _position_slopes(self.bare_motion, _of_channel(self.model, "position"))
+        return _position_slopes(self.bare_motion, of_channel(self.model, "position"))
 
     @cached_property
     def sampled_impedance(self) -> np.ndarray:
@@ -190,7 +190,7 @@ def predict_at(
     return Prediction(model, group, sampling, structure, par, plane, solution, U)
 
 
-def _of_channel(model: Model, channel: str) -> list[Effect]:
+def of_channel(model: Model, channel: str) -> list[Effect]:
     """Effects of a model that act there."""
     return [e for e in model.effects if e.hypothesis.channel == channel]
 

@@ -36,7 +36,7 @@ def law_noise(pred: Prediction, group: Group) -> np.ndarray:
     for effect in at_motor:
         j = effect.hypothesis.joint
         off, as_seen = (effect.hypothesis.law(effect.p, x, j, pred.par.stiffness[j]) for x in motions)
-        change = pred.plane.record * pred.motion().lines(off - as_seen)
+        change = pred.plane.record * seen.lines(off - as_seen)
         out[:, j] += mean_over_lines(np.mean(np.abs(change) ** 2, axis=0), NOISE_LINES)
     return out
 

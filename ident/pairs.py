@@ -73,6 +73,6 @@ def beside_rivals(
     if cost - current.count > allowed:
         return None
     ranked = sorted(((s.hypothesis, r) for _, i, s, r in found if i == best), key=lambda x: x[1].cost)
-    first = [c for c in last.candidates if c is rivals[best]]
-    renamed = replace(last, candidates=(*first, *(c for c in last.candidates if c is not rivals[best])))
+    rival = rivals[best]
+    renamed = replace(last, candidates=(rival, *(c for c in last.candidates if c is not rival)))
     return [*rounds[:-1], renamed], weighed_round(stages[best], ranked, scores[best], {})

@@ -82,8 +82,8 @@ def beside_strong(
         except NOT_COMPUTED:
             return None
 
-    top = min(ranked, key=lambda x: x[1].cost)[0] if ranked else None
-    likely, key = (top.joint, top.key) if top else (-1, None)
+    top = min(ranked, key=lambda x: x[1].cost, default=None)
+    likely, key = (top[0].joint, top[0].key) if top else (-1, None)
     chosen = strong_effects(problem, before, scores, likely, quiet)
     few = thinned(problem)
     without = without_strong(few, before if few is problem else replace(before, softer=())) if chosen else ()
@@ -100,9 +100,7 @@ def beside_strong(
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     # Noise along the record is taken large: a law that leaves as much even in that as no law, or clearly more than the
     # best, is far off.
-    allowed = before.costs
-    if ranked:
-        allowed = np.minimum(allowed, FAR_BEHIND * min(ranked, key=lambda x: x[1].cost)[1].costs)
+    allowed = np.minimum(before.costs, FAR_BEHIND * top[1].costs) if top else before.costs
     along = sorted(
         (
             (h, r)
