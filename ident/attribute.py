@@ -20,6 +20,7 @@ from ident.contests import weighed_again
 from ident.evidence import Candidate, last_is_pointless
 from ident.faint import SEEN, hidden
 from ident.hypotheses import Hypothesis, catalogue
+from ident.left_out import carries_over
 from ident.model import Effect, is_along_record
 from ident.pairs import beside_rivals
 from ident.parallel import Workers
@@ -29,6 +30,7 @@ from ident.refits import (
     FAINT,
     POLISH_STEPS,
     RECORD_EXCESS,
+    beside_its_error,
     clip_to_bounds,
     either_turn,
     extended_by,
@@ -116,6 +118,7 @@ def attribute(
         if settled(current) and looped is not current:
             # Along the record noise is taken large, and hides other causes.
             current = looped = as_loops(problem, current, workers)
+        last, named = current, tuple(rounds)
         told = baseline.costs - current.costs
         quiet_as_a_whole = settled(less_errors_of_laws(current, told)) and not np.any(loud(current, told))
         asked, faint = hypotheses, not clear or quiet_as_a_whole
@@ -157,6 +160,11 @@ def attribute(
         rounds = renamed(rounds, effects, current.model.effects)
         taken = {e.hypothesis.key for e in (*effects, *current.model.effects)}
         current = pruned(problem, current)
+        if problem.motions_alone and current.chi2_per_dof > FAINT and not best.hypothesis.decoy:
+            workers.say("parts of the motions left out")
+            if not carries_over(problem, last, current, int(np.argmax(found.falls)), workers):
+                current, rounds = last, list(named)
+                break
         if len(rounds) > 1:
             # What is sought next would make up for a cause that was named wrongly as long as this one was missing.
             current, earlier = weighed_again(problem, current, rounds[:-1], workers)
@@ -172,6 +180,7 @@ def attribute(
     if len(itself) < len(effects) and not workers.late:
         current = plainer(problem, current, every, {e.hypothesis.key for e in itself})
         rounds = renamed(rounds, effects, current.model.effects)
+    current = beside_its_error(problem, current)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)

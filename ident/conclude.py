@@ -32,6 +32,7 @@ from ident.trust import (
     fails_held_out,
     known_probability,
     left_of,
+    left_on_held_out,
     patchwork,
     shadowed,
     shown,
@@ -104,7 +105,11 @@ def conclude(
     rounds = {r.candidates[0].hypothesis.key: r for r in result.rounds}
     for effect in named_effects(final):
         found = rounds[effect.hypothesis.key]
-        trust = known_probability(left_of(effect.hypothesis, result), doubted)
+        share = left_of(effect.hypothesis, result)
+        # Other motions meet whatever else the description of an arm lacks.
+        if not (problem.motions_alone or halved):
+            share = max(share, left_on_held_out(effect.hypothesis, gain))
+        trust = known_probability(share, doubted)
         trust *= explained_share(found, final)
         doubtful = (
             pointless(effect, final.model.par.stiffness[effect.hypothesis.joint])

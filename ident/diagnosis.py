@@ -11,7 +11,6 @@ import numpy as np
 
 from ident.attribute import Attribution, attribute
 from ident.baseline import fit_baseline
-from ident.chain import build_structure
 from ident.conclude import conclude, named_effects, roll_off_note
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
@@ -28,17 +27,18 @@ from ident.identification import (
     under_noise_beside_causes,
     with_noise_of_fast_lines,
 )
+from ident.left_out import errors_on_parts, joined, refitted
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
-from ident.model import Effect, Model
+from ident.model import Effect
 from ident.next_experiment import separating_experiment
 from ident.parallel import Workers, one_thread_each
 from ident.period_checks import unrepeated
-from ident.problem import NOT_COMPUTED, Problem, predictions
+from ident.problem import NOT_COMPUTED, predictions
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
-from ident.rigid import RigidFit, carried_over, cut, fit_rigid
+from ident.rigid import RigidFit, carried_over, fit_rigid
 from ident.tones import Tone, find_tones
 from ident.torque_checks import mislabelled
-from ident.torque_fit import Fit, fit
+from ident.torque_fit import Fit
 from ident.trust import LEFT_ERROR, denied, known_probability
 from ident.units import torque_unit, units_of_torques
 from ident.verdict import LEFT_OUT, UNKNOWN, Diagnosis, Gain, Verdict
@@ -51,9 +51,7 @@ SETTLED_BY_INERTIAS = 0.7
 # them
 CARRIED_OVER = 0.9
 LEFT_TO_LINKS = 1e-3  # share of the discrepancy up to which errors of the laws of causes, not links, are what is left
-PARTS = 8  # of the motions, left out in turn to see which inertias foretell them
 TOWARDS = 0.68  # level of the interval that says so: neither choice is the safe one
-AGAIN = 4  # iterations of a fit to records of which a part is left out
 MAX_SECONDS = 600.0  # of search for causes
 SEED = 0
 
@@ -358,40 +356,11 @@ def foretold(setup: Setup, one: Fit, other: Fit, workers: Workers) -> tuple[floa
 
     Motions that are held out take no part in the choice: they measure what it gains.
     """
-    problem = setup.problem
-
-    def without(part: int) -> Errors:
-        kept, out = ([cut(group, part, PARTS, inside) for group in problem.groups] for inside in (False, True))
-        models = [refitted(problem, kept, start, start is other, start.remainders) for start in (one, other)]
-        return segment_errors(problem, out, *models)[0]
-
     try:
-        errors = joined(workers.map(without, range(PARTS)))
+        errors = errors_on_parts(setup.problem, one, other, workers, renewed=True)
     except NOT_COMPUTED:
         return np.inf, np.inf
     return ratio_interval(errors, np.random.default_rng(SEED), TOWARDS)
-
-
-def refitted(
-    problem: Problem, groups: Sequence[Group], start: Fit, renewed: bool, remainders: Sequence[np.ndarray]
-) -> Model:
-    """The model of a fit on other records.
-
-    Args:
-        renewed: whether the inertias of the links are found from these too.
-        remainders: of these records, from which the fit starts.
-    """
-    model, problem = start.model, replace(problem, groups=tuple(groups))
-    if renewed:
-        links = fit_rigid(build_structure(problem.structure.robot), problem.nominal, groups)
-        model, problem = replace(model, structure=links.structure), replace(problem, nominal=links.par)
-    return fit(problem, model, iterations=AGAIN, remainders=list(remainders)).model
-
-
-def joined(errors: Sequence[Errors]) -> Errors:
-    """Errors one below the other."""
-    names = tuple(name for e in errors for name in e.segments)
-    return Errors(names, *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")))
 
 
 def left_over(one: Fit, other: Fit) -> float:

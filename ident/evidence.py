@@ -114,7 +114,8 @@ def weigh(
     difference at a joint counts only against ``temper + MODEL_ERROR_SHARE x excess`` there. Parameters count by how far
     the data narrow them down (``occam``), at the joints where the effect is seen. What explains far less than the best
     of them may be another cause, at a joint that little is left at: all that it leaves counts as at the joints of the
-    best.
+    best. A load and a change of the body that bears it are one body to the data but for how its inertia may turn out:
+    what sets them apart at any joint counts against the model error at all of them, which reaches them all.
 
     Args:
         excess: (n,) cost beyond noise by joint that the best of them leaves (``errors_by_joint``).
@@ -129,6 +130,11 @@ def weigh(
     seen = 1.0 / float(np.sum(where / tempers))
     more = costs - costs[np.argmin(np.sum(costs, axis=1))]
     evidence = -0.5 * np.sum(more / tempers, axis=1)
+    bears = np.array([c.hypothesis.bears_load for c in candidates])
+    if np.any(bears):
+        top = np.flatnonzero(bears)[np.argmin(np.sum(costs[bears], axis=1))]
+        behind = np.sum(costs - costs[top], axis=1) / (temper + MODEL_ERROR_SHARE / 6.0 * np.sum(excess))
+        evidence = np.where(bears, evidence[top] - 0.5 * behind, evidence)
     far = np.sum(more, axis=1) > FAR * np.sum(falls)
     evidence = np.where(far, np.minimum(evidence, -0.5 * np.sum(more, axis=1) / seen), evidence) - DECOY_NATS * decoy
     evidence += [occam(c, seen) + odds(c) for c in candidates]

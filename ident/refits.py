@@ -16,7 +16,7 @@ from ident.model import Effect, Model, is_along_record, is_dry
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
 from ident.screening import Score
 from ident.torque_fit import Fit, fit
-from ident.weights import make_weights
+from ident.weights import make_weights, with_model_error
 
 FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched from linear steps that keep the data
 FINALISTS = 3  # candidates that are fitted to the end
@@ -62,6 +62,23 @@ def polish(problem: Problem, result: Fit) -> Fit:
         remainders=result.remainders,
         exact=True,
     )
+
+
+def beside_its_error(problem: Problem, result: Fit) -> Fit:
+    """A model of motions fitted as is best beside the error that it leaves, where that is far above the noise.
+
+    What it leaves by joint is told in units of the noise as before, and standard deviations are those beside the error.
+    """
+    if not problem.motions_alone or result.chi2_per_dof <= FAINT:
+        return result
+    preds = predictions(problem, result.model, result.remainders)
+    weights = with_model_error(problem, preds, result.weights)
+    try:
+        other = fit(problem, result.model, iterations=POLISH_STEPS, weights=weights, remainders=result.remainders)
+        same = reweighted(problem, other, result.weights)
+    except NOT_COMPUTED:
+        return result
+    return replace(same, information=other.information * same.chi2_per_dof / max(1.0, other.chi2_per_dof))
 
 
 def reweighted(problem: Problem, result: Fit, weights: Weights) -> Fit:

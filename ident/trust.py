@@ -24,7 +24,7 @@ from ident.quantization import Steps
 from ident.refits import settled
 from ident.rounds import MIN_EVIDENCE, Round
 from ident.torque_fit import Fit
-from ident.verdict import Gain
+from ident.verdict import Gain, JointGain
 from ident.weights import make_weights
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
@@ -67,6 +67,20 @@ def left_of(h: Hypothesis, result: Attribution) -> float:
     before = _at(h, _excess(result.baseline, 1.0))
     after = _at(h, _excess(result.final, level))
     return float(np.clip(after / max(before, 1e-300), 0.0, 1.0)) if after > 0.0 else 0.0
+
+
+def left_on_held_out(h: Hypothesis, gain: Gain | None) -> float:
+    """Share, as power, that the extended model leaves of the error of the first one on held-out data where an effect
+    sits; 0 where that is not clear of the noise.
+
+    What stands for an unknown cause in the postures that were fitted leaves more of it in another one.
+    """
+    if gain is None:
+        return 0.0
+    at: Gain | JointGain = gain if h.on_chain or not gain.by_joint else list(gain.by_joint.values())[h.joint]
+    if not at.before > CLEAR * at.noise_floor:
+        return 0.0
+    return float(np.clip((at.after - at.noise_floor) / (at.before - at.noise_floor), 0.0, 1.0) ** 2)
 
 
 def explained_share(found: Round, final: Fit) -> float:

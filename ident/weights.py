@@ -44,12 +44,31 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
                 1:, links, links
             ].real.mean(axis=0)
             S[:, links, links] += np.clip(left, 0.0, LINK_ERROR**2 * power[1:, links].mean(axis=0))
-        root = np.linalg.inv(np.linalg.cholesky(S)) * np.sqrt(2.0)
-        root[0] /= np.sqrt(2.0)
-        whiten.append(root)
+        whiten.append(whitening(S))
         covariance.append(S)
     weights = Weights(tuple(whiten), tuple(covariance))
     return replace(weights, by_noise=noise_of(problem, predictions, weights, laws)) if known else weights
+
+
+def with_model_error(problem: Problem, predictions: Sequence[Prediction], weights: Weights) -> Weights:
+    """Weights under noise and the error of the model that is left beside it, of each output as much at all lines.
+
+    Where that error is far above the noise the lines of least noise are no better known than others.
+    """
+    whiten, covariance = [], []
+    for group, pred, S in zip(problem.groups, predictions, weights.covariance, strict=True):
+        left = np.mean(np.abs(output_error(group, pred)[:, 1:]) ** 2, axis=(0, 1)) / group.window_share
+        S = S + np.diag(np.maximum(left - np.einsum("kii->ki", S[1:]).real.mean(axis=0), 0.0))
+        covariance.append(S)
+        whiten.append(whitening(S))
+    return Weights(tuple(whiten), tuple(covariance))
+
+
+def whitening(S: np.ndarray) -> np.ndarray:
+    """Whitening of complex lines of covariance (K, o, o), the first of which is real."""
+    root = np.linalg.inv(np.linalg.cholesky(S)) * np.sqrt(2.0)
+    root[0] /= np.sqrt(2.0)
+    return root
 
 
 def _signals(group: Group, prediction: Prediction) -> np.ndarray:

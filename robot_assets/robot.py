@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from robot_assets.errors import DataError
+from robot_assets.spelling import joint_tables
 from robot_assets.urdf import Description, read_urdf
 from robot_assets.values import MISSING, exists, number, read_toml, show, subtable, tables, text, vector
 
 ASSETS = Path(__file__).parent
 # Figures of a joint by other names that they go by.
 OTHER_NAMES = {
+    "gear_ratio": ("gear", "ratio"),
     "stiffness": ("spring_stiffness", "gear_stiffness"),
     "damping": ("spring_damping", "gear_damping"),
     "viscous_friction": ("motor_viscous_friction", "motor_viscous", "viscous"),
@@ -136,7 +138,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     data = read_toml(path, "robot")
     urdf, mesh_dir = _urdf(data.get("urdf"), folder, where)
     tree = read_urdf(urdf)
-    joints = tuple(_joint(entry, i, where, tree) for i, entry in enumerate(tables(data, "joint", where)))
+    joints = tuple(_joint(entry, i, where, tree) for i, entry in enumerate(joint_tables(data, where)))
     if not joints:
         raise DataError("[[joint]]", where, "none", "at least one driven joint")
     names = [j.name for j in joints]

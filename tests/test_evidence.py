@@ -52,7 +52,7 @@ from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_
 from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, choose, explore, other_bodies
 from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
-from ident.trust import fails_held_out, patchwork, shadowed, shown
+from ident.trust import fails_held_out, left_on_held_out, patchwork, shadowed, shown
 from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, JointGain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
@@ -625,6 +625,20 @@ def test_a_posture_left_out_of_two_refutes_what_closes_less_than_half(after, ref
     """Of a model that is fitted to half of the data."""
     gain = Gain(("a",), "RMS", 10.0, after, 1.0, (10.0 - after) / 9.0, None, LEFT_OUT)
     assert fails_held_out(gain, SimpleNamespace(chi2_per_dof=1.0), 0.0, halved=True) == refuted
+
+
+def test_a_name_is_trusted_by_what_held_out_data_leave_where_it_sits():
+    """At its own joint, or over all that are looked at where it changes the chain; nothing is said next to the noise."""
+    closed = JointGain(10.0, 3.7, 1.0)
+    gain = Gain(("a",), "RMS", 10.0, 1.0, 1.0, 1.0, None, "validation segments")
+    chain, *own = (SimpleNamespace(on_chain=j < 0, joint=j) for j in (-1, 0, 1, 2))
+    assert left_on_held_out(own[1], None) == left_on_held_out(own[1], gain) == 0.0
+    by_joint = {"one": JointGain(9.0, 1.0, 1.0), "two": closed, "three": JointGain(1.9, 1.9, 1.0)}
+    gain = replace(gain, by_joint=by_joint)
+    assert [left_on_held_out(h, gain) for h in own] == [0.0, pytest.approx(0.09), 0.0]
+    assert left_on_held_out(chain, gain) == 0.0
+    worse = replace(gain, by_joint=by_joint | {"two": JointGain(10.0, 19.0, 1.0)})
+    assert left_on_held_out(own[1], worse) == 1.0
 
 
 def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():
@@ -1586,6 +1600,25 @@ def test_a_body_with_its_load_and_without_stay_in_a_contest():
         for h, c in ((bare, 10.2), (bare, 10.1), (loaded, 10.0), (load, 10.3), (load, 12.0))
     ]
     assert [(c.hypothesis, c.fit.cost) for c in best_of_each(ran)] == [(loaded, 10.0), (bare, 10.1), (load, 10.3)]
+
+
+def test_a_load_and_a_change_of_the_body_that_bears_it_differ_by_no_more_than_what_another_law_leaves_anywhere():
+    """By 120 at joints 1 to 5, where the better one leaves 1e4 of another law at joint 6."""
+    more, excess, falls = np.array([24.0] * 5 + [0.0]), np.array([0.0] * 5 + [1e4]), np.full(6, 1e6)
+
+    def odds(carries):
+        """Log odds of the change of the body over the load, of what data tell."""
+        bodies = candidate(link_inertia("wrist_3_link", 5, carries), [1.2, 0.0, 0.0, 0.0, 1.0], np.zeros(5))
+        load = candidate(payload("wrist_3_link"), [0.5, 0.1, 0.0, 0.0, *[1e-3] * 3], np.zeros(7))
+        left = np.full(6, 1e3)
+        pair = [replace(c, fit=replace_costs(c.fit, x)) for c, x in ((bodies, left), (load, left + more))]
+        same = [replace(c, fit=replace_costs(c.fit, left)) for c in pair]
+        found = [{c.hypothesis.effect: c.log_evidence for c in weigh(x, excess, falls)} for x in (pair, same)]
+        with_more, without = (x["link_inertia"] - x["payload"] for x in found)
+        return with_more - without
+
+    assert odds(False) == pytest.approx(0.5 * 120.0 / TEMPER)
+    assert odds(True) == pytest.approx(0.5 * 120.0 / (TEMPER + 0.05 * 1e4))
 
 
 def test_a_body_that_a_load_may_change_costs_no_more_where_it_changes_little(named):

@@ -73,9 +73,70 @@ def test_what_a_robot_may_leave_out_is_of_its_urdf_or_guessed(tmp_path):
 @pytest.mark.parametrize(("key", "other"), [(key, other) for key, others in OTHER_NAMES.items() for other in others])
 def test_a_figure_goes_by_its_other_names(tmp_path, ur10, key, other):
     """Each is read as the figure that it is another name of, which the text does not have then."""
-    bare = re.sub(rf"^{key} = .*\n", "", (ur10.folder / "robot.toml").read_text(), flags=re.M)
-    (tmp_path / "robot.toml").write_text(bare.replace("\ngear_ratio", f"\n{other} = 2.5\ngear_ratio"))
+    text = (ur10.folder / "robot.toml").read_text()
+    head, *joints = text.split("[[joint]]\n")
+    joints = [re.sub(rf"^{key} = .*\n", "", own, flags=re.M) for own in joints]
+    (tmp_path / "robot.toml").write_text(head + "".join(f"[[joint]]\n{other} = 2.5\n{own}" for own in joints))
     assert np.all(load_robot(tmp_path).array(key) == 2.5)
+
+
+TWO = ("shoulder", "elbow")
+FIGURES = {"gear_ratio": (100.0, 50.0), "motor_inertia": (2.0, 1.0), "stiffness": (4e4, 1e4), "damping": (30.0, 8.0)}
+FIGURES |= {"viscous_friction": (15.0, 6.0)}
+LISTS = "".join(f"{key} = {list(values)}\n" for key, values in FIGURES.items())
+EACH = tuple("".join(f"{key} = {values[i]}\n" for key, values in FIGURES.items()) for i in range(2))
+NAMED = 'names = ["shoulder", "elbow"]\n'
+
+
+def planar(folder, drives):
+    """An arm of two joints whose drives are written in some way."""
+    joints = "".join(
+        f'<joint name="{name}" type="revolute"><parent link="l{i}"/><child link="l{i + 1}"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="40" velocity="3"/></joint>'
+        for i, name in enumerate(TWO)
+    )
+    links = "".join(f'<link name="l{i}"/>' for i in range(3))
+    (folder / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    (folder / "robot.toml").write_text(f'urdf = "arm.urdf"\n{drives}')
+    return folder
+
+
+@pytest.mark.parametrize(
+    "drives",
+    [
+        "".join(f'[[joint]]\nname = "{name}"\n{own}' for name, own in zip(TWO, EACH, strict=True)),
+        "".join(f'[[drives]]\njoint = "{name}"\n{own}' for name, own in zip(TWO, EACH, strict=True)),
+        "".join(f"[joints.{name}]\n{own}" for name, own in zip(TWO, EACH, strict=True)),
+        f"[drives]\n{NAMED}{LISTS}",
+        f'joints = ["shoulder", "elbow"]\n[drives]\n{LISTS}',
+    ],
+)
+def test_drives_are_read_in_each_way_of_writing_them_down(tmp_path, drives):
+    robot = load_robot(planar(tmp_path, f"{drives}[noise]\nq_std = 2e-6\ntau_std = [0.1, 0.02]\n"))
+    assert robot.joint_names == TWO
+    assert {key: tuple(robot.array(key)) for key in FIGURES} == FIGURES
+    assert robot.array("q_std").tolist() == [2e-6, 2e-6] and robot.array("tau_std").tolist() == [0.1, 0.02]
+
+
+@pytest.mark.parametrize(
+    ("drives", "found"),
+    [
+        ("", "none"),
+        (f"[drives]\n{LISTS}", "gear_ratio"),
+        (f"[drives]\n{NAMED}{LISTS.replace('[2.0, 1.0]', '[2.0]')}", "[2.0]"),
+        (f"[drives]\n{NAMED}{LISTS.replace('[2.0, 1.0]', '2.0')}", "2.0"),
+        (f"[drives]\n{NAMED}{LISTS}[noise]\nq_std = [1e-6]", "1e-06"),
+        ('joints = ["shoulder", "elbow"]\ndrives = 3', "3"),
+        (f'[[joint]]\nname = "shoulder"\n{EACH[0]}[[drive]]\njoint = "elbow"\n{EACH[1]}', "[[joint]] beside it"),
+        (f"[[drive]]\n{EACH[0]}", "no such key"),
+        (f"[[drive]]\njoint = 3\n{EACH[0]}", "3"),
+        ("joint = 3", "3"),
+    ],
+)
+def test_drives_written_otherwise_are_one_clear_error(tmp_path, drives, found):
+    with pytest.raises(DataError) as caught:
+        load_robot(planar(tmp_path, drives))
+    assert found in str(caught.value) and "robot.toml" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_an_unknown_robot_lists_the_known_ones():

@@ -173,6 +173,11 @@ class Hypothesis:
         return self.joint < 0 or self.channel == "model"
 
     @property
+    def bears_load(self) -> bool:
+        """Whether it changes the body at the flange, of which an unknown load is a part to the data."""
+        return self.effect == "payload" or bool(self.options.get("carries_load"))
+
+    @property
     def key(self) -> tuple[str, str]:
         """Effect and place."""
         return self.effect, self.place

@@ -1,0 +1,75 @@
+"""The drives of a ``robot.toml`` in the ways in which people write them down: each as the table of one joint.
+
+``[[joint]]`` is the way of this project. What else says the same without doubt is read too: another name of the array,
+a table of each joint by its name, or lists in the order of the joints.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from robot_assets.errors import DataError
+from robot_assets.values import show, subtable, tables
+
+NAMES = ("joint", "joints", "drive", "drives")
+NOISE = ("q_std", "tau_std")
+
+
+def joint_tables(data: dict[str, Any], where: str) -> list[dict[str, Any]]:
+    """The tables of the driven joints, from the base on, each with its ``name``.
+
+    Raises:
+        DataError: where the drives are written in two ways, lists differ in length, or a joint has no name.
+    """
+    used = [key for key in NAMES if key in data]
+    lists = len(used) == 2 and _all(data[used[0]], str)  # the names, and a table of lists in their order
+    if len(used) > 1 and not lists:
+        raise DataError(f"[[{used[1]}]]", where, f"[[{used[0]}]] beside it", "the drives in one place")
+    entries = _of_lists(data[used[1]], data[used[0]], where) if lists else _entries(data, used, where)
+    return _with_noise(entries, subtable(data, "noise", where), where)
+
+
+def _entries(data: dict[str, Any], used: list[str], where: str) -> list[dict[str, Any]]:
+    key = used[0] if used else NAMES[0]
+    entry = data.get(key)
+    if isinstance(entry, dict) and _all(list(entry.values()), dict):
+        return [{"name": name, **own} for name, own in entry.items()]
+    if isinstance(entry, dict):
+        named = [k for k in ("name", "names", "joint", "joints") if k in entry]
+        if len(named) != 1 or not _all(entry[named[0]], str):
+            raise DataError(f"[{key}]", where, show(sorted(entry)), "[[joint]] tables, or lists with one of names")
+        return _of_lists({k: v for k, v in entry.items() if k != named[0]}, entry[named[0]], where)
+    return [_named(own) for own in tables(data, key, where)]
+
+
+def _named(entry: dict[str, Any]) -> dict[str, Any]:
+    """The table of a drive that says which joint it turns, with that as its name."""
+    if "name" in entry or "joint" not in entry:
+        return entry
+    return {"name": entry["joint"], **{k: v for k, v in entry.items() if k != "joint"}}
+
+
+def _of_lists(lists: Any, names: list[str], where: str) -> list[dict[str, Any]]:
+    if not isinstance(lists, dict):
+        raise DataError("drives", where, show(lists), "a table of lists in the order of the joints")
+    for key, values in lists.items():
+        if not isinstance(values, list) or len(values) != len(names):
+            raise DataError(key, where, show(values), f"a list of {len(names)} in the order of {names}")
+    return [{"name": name, **{k: v[i] for k, v in lists.items()}} for i, name in enumerate(names)]
+
+
+def _with_noise(entries: list[dict[str, Any]], noise: dict[str, Any], where: str) -> list[dict[str, Any]]:
+    """Noise as a dataset names it, ``[noise]`` with a figure for all or one for each, given to joints that have none."""
+    given = {k: noise[k] for k in NOISE if k in noise}
+    for key, values in given.items():
+        if isinstance(values, list) and len(values) != len(entries):
+            raise DataError(f"[noise] {key}", where, show(values), f"a number, or a list of {len(entries)}")
+
+    def of(i: int) -> dict[str, Any]:
+        return {k: v[i] if isinstance(v, list) else v for k, v in given.items()}
+
+    return [{**of(i), **entry} for i, entry in enumerate(entries)]
+
+
+def _all(values: Any, kind: type) -> bool:
+    return isinstance(values, list) and bool(values) and all(isinstance(v, kind) for v in values)
