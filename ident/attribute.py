@@ -20,7 +20,7 @@ from ident.contests import weighed_again
 from ident.evidence import Candidate, last_is_pointless
 from ident.faint import SEEN, hidden
 from ident.hypotheses import Hypothesis, catalogue
-from ident.left_out import carries_over
+from ident.left_out import carries_over, with_error_as_noise
 from ident.model import Effect, is_along_record
 from ident.pairs import beside_rivals
 from ident.parallel import Workers
@@ -109,7 +109,7 @@ def attribute(
     p_value = p_detected = discrepancy_p_value(baseline)
     level = DOUBTED_LEVEL if implausible(problem, baseline) else DETECTION_LEVEL
     clear = p_value < level and (baseline.chi2_per_dof > DETECTION_EXCESS or np.any(loud(baseline)))
-    current, rounds, unknown, looped = baseline, [], False, None
+    given, current, rounds, unknown, looped = problem, baseline, [], False, None
     if known is not None and known.final.model.effects:
         current, rounds = carried_on(problem, known, workers)
         hypotheses = untaken(hypotheses, current.model.effects)
@@ -122,12 +122,15 @@ def attribute(
         told = baseline.costs - current.costs
         quiet_as_a_whole = settled(less_errors_of_laws(current, told)) and not np.any(loud(current, told))
         asked, faint = hypotheses, not clear or quiet_as_a_whole
+        if not asked or (faint and problem is not given):
+            break
         if faint:
             workers.say("what the noise as a whole would hide")
             asked, by_chance = hidden(problem, current, hypotheses, told)
             if not asked:
                 break
             p_detected = p_detected if clear or rounds else by_chance
+        by_joint = problem.motions_alone and not faint and current.chi2_per_dof > FAINT
         workers.say(f"cause {count + 1}: screening {len(asked)} hypotheses")
         # What is left beside a cause is mostly what its law lacks, and no hinge unless little is left; what is faint
         # shows none everywhere.
@@ -141,7 +144,11 @@ def attribute(
             much = not faint and left_share(baseline, current) > LEFT_TO_PAIRS and not workers.late
             pair = beside_rivals(problem, current, rounds, hypotheses, workers) if much else None
             if pair is None:
-                break
+                if not by_joint:
+                    break
+                joint = int(np.argmax(current.costs - current.counts))
+                problem, current, hypotheses = elsewhere(problem, current, hypotheses, joint)
+                continue
             rounds, found = pair
         found = with_name(found)
         best = found.candidates[0]
@@ -150,7 +157,10 @@ def attribute(
         nameless = best.hypothesis.decoy and not best.hypothesis.options.get("of_record")
         unknown = unknown or (nameless and left_share(baseline, current) > LEFT_TO_DECOYS)
         if best.hypothesis.decoy and not best.hypothesis.options.get("baseline"):
-            break
+            if not by_joint or best.hypothesis.on_chain:
+                break
+            problem, current, hypotheses = elsewhere(problem, current, hypotheses, best.hypothesis.joint)
+            continue
         current = from_other_motions(problem, polish(problem, best.fit), workers)
         if current.chi2_per_dof > FAINT and not best.hypothesis.decoy:
             current, more = companions(problem, current, best, hypotheses)
@@ -162,16 +172,36 @@ def attribute(
         current = pruned(problem, current)
         if problem.motions_alone and current.chi2_per_dof > FAINT and not best.hypothesis.decoy:
             workers.say("parts of the motions left out")
-            if not carries_over(problem, last, current, int(np.argmax(found.falls)), workers):
-                current, rounds = last, list(named)
-                break
+            joint = int(np.argmax(found.falls))
+            if not carries_over(problem, last, current, joint, workers):
+                rounds, count = list(named), count - 1
+                rest = tuple(h for h in hypotheses if h.key != best.hypothesis.key)
+                problem, current, hypotheses = elsewhere(problem, last, rest, joint)
+                continue
         if len(rounds) > 1:
             # What is sought next would make up for a cause that was named wrongly as long as this one was missing.
             current, earlier = weighed_again(problem, current, rounds[:-1], workers)
             rounds = [*earlier, rounds[-1]]
         hypotheses = tuple(h for h in untaken(hypotheses, current.model.effects) if h.key not in taken)
+    if problem is not given:
+        problem, current = given, polish(given, current)
     if looped is not current and not workers.late:
         current = as_loops(problem, current, workers)
+    current, rounds = at_the_end(problem, current, rounds, every, workers)
+    left = {e.hypothesis.key for e in current.model.effects}
+    kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
+    unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
+    return Attribution(baseline, clear or bool(kept), p_detected if kept else p_value, kept, current, unknown)
+
+
+def at_the_end(
+    problem: Problem, current: Fit, rounds: list[Round], every: Sequence[Hypothesis], workers: Workers
+) -> tuple[Fit, list[Round]]:
+    """All causes beside each other: those that the last ones made needless, rivals, special cases, and the last fit.
+
+    Args:
+        every: hypotheses that were asked at first.
+    """
     current = without_shadows(problem, current, rounds, workers)
     current, rounds = weighed_again(problem, current, rounds, workers)
     effects = current.model.effects
@@ -180,11 +210,19 @@ def attribute(
     if len(itself) < len(effects) and not workers.late:
         current = plainer(problem, current, every, {e.hypothesis.key for e in itself})
         rounds = renamed(rounds, effects, current.model.effects)
-    current = beside_its_error(problem, current)
-    left = {e.hypothesis.key for e in current.model.effects}
-    kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
-    unknown = unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
-    return Attribution(baseline, clear or bool(kept), p_detected if kept else p_value, kept, current, unknown)
+    return beside_its_error(problem, current), rounds
+
+
+def elsewhere(
+    problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], joint: int
+) -> tuple[Problem, Fit, tuple[Hypothesis, ...]]:
+    """A search of motions that goes on at other joints than one at which what is left follows no law of the catalogue:
+    there it counts as noise from then on.
+
+    Along measured motions the torque of one joint tells nothing of that of another.
+    """
+    other = with_error_as_noise(problem, current, joint)
+    return other, polish(other, current), tuple(h for h in hypotheses if h.joint != joint)
 
 
 def carried_on(problem: Problem, known: Attribution, workers: Workers) -> tuple[Fit, list[Round]]:

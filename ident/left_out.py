@@ -12,7 +12,7 @@ from ident.gain import Errors, ratio_interval, segment_errors
 from ident.group import Group
 from ident.model import Model
 from ident.parallel import Workers
-from ident.problem import NOT_COMPUTED, Problem
+from ident.problem import NOT_COMPUTED, Problem, predictions, residual
 from ident.rigid import cut, fit_rigid
 from ident.torque_fit import Fit, fit
 
@@ -81,3 +81,14 @@ def carries_over(problem: Problem, before: Fit, after: Fit, joint: int, workers:
         return False
     own = replace(errors, **{f: getattr(errors, f)[:, [joint]] for f in ("before", "after", "noise")})
     return any(ratio_interval(e, np.random.default_rng(SEED), CARRIES)[1] < 1.0 for e in (own, errors))
+
+
+def with_error_as_noise(problem: Problem, result: Fit, joint: int) -> Problem:
+    """The problem of motions with what a model leaves at a joint taken for noise of its torque."""
+    powers = [
+        problem.samples(group) * np.mean(np.abs(residual(group, pred)[:, 1:, joint]) ** 2) / group.window_share
+        for group, pred in zip(problem.groups, predictions(problem, result.model, result.remainders), strict=True)
+    ]
+    tau_std = problem.tau_std.copy()
+    tau_std[joint] = np.hypot(tau_std[joint], np.sqrt(np.mean(powers)))
+    return replace(problem, tau_std=tau_std)

@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from ident.attribute import attribute
+from ident.chain import build_structure
 from ident.dataset import Dataset, Segment
 from ident.hypotheses import catalogue
 from ident.identification import identify
@@ -19,6 +21,7 @@ from tests.conftest import through_postures
 pytestmark = pytest.mark.xdist_group("left_out")  # one worker makes what they share
 
 RATE, SECONDS, COULOMB = 100.0, 60.0, 20.0
+SPRING = 3.0  # N m/rad
 WANDER = 8.0  # N, of a force that follows nothing
 
 
@@ -30,16 +33,17 @@ def wandering(rng, t):
     return WANDER * slow / slow.std()
 
 
-@pytest.fixture(scope="module")
-def wandered():
-    """Motions of one linear drive, with friction and a force that nothing of the model explains; the problem and the
-    fit without any cause."""
-    robot, segments = load_robot("emps"), []
+def recorded(robot, torques, scale=1.0):
+    """Motions with torques of their own and a force at the first joint that nothing of the model explains; the problem
+    and the fit without any cause."""
+    segments = []
     for i, role in enumerate(("identification", "validation")):
         rng = np.random.default_rng(40 + i)
-        t, q, v, a = (0.3 * x if x.ndim > 1 else x for x in through_postures(rng, 1, RATE, SECONDS))
-        force = 95.1 * a + 203.5 * v + COULOMB * np.sign(v) + wandering(rng, t)[:, None]
-        tau = force + 0.01 * rng.normal(size=force.shape)
+        t, *motion = through_postures(rng, robot.n, RATE, SECONDS)
+        q, v, a = (scale * x for x in motion)
+        tau = torques(q, v, a)
+        tau[:, 0] += wandering(rng, t)
+        tau += 0.01 * rng.normal(size=tau.shape)
         segments.append(Segment(name=f"m{i}", role=role, kind="trajectory", t=t, tau=tau, q=q))
     data = Dataset(
         name="wandered",
@@ -47,13 +51,50 @@ def wandered():
         sample_rate=RATE,
         joints=robot.joint_names,
         input_hold="none",
-        q_std=np.full(1, 1e-7),
-        tau_std=np.full(1, 0.01),
+        q_std=np.full(robot.n, 1e-7),
+        tau_std=np.full(robot.n, 0.01),
         controller=None,
         segments=tuple(segments),
     )
     setup, first = identify(data)
     return setup.problem, first
+
+
+@pytest.fixture(scope="module")
+def wandered():
+    """One linear drive with friction."""
+    return recorded(load_robot("emps"), lambda q, v, a: 95.1 * a + 203.5 * v + COULOMB * np.sign(v), 0.3)
+
+
+@pytest.fixture(scope="module")
+def wandered_arm(tmp_path_factory):
+    """Two joints on upright axes with friction, and a spring at the second one."""
+    folder = tmp_path_factory.mktemp("planar")
+    bodies = "".join(
+        f'<link name="l{i}"><inertial><origin xyz="0.2 0 0"/><mass value="{5 * i}"/>'
+        '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        for i in (1, 2)
+    )
+    joints = "".join(
+        f'<joint name="j{i}" type="revolute"><parent link="l{i - 1}"/><child link="l{i}"/><axis xyz="0 0 1"/>'
+        f'<origin xyz="{0.4 * (i - 1)} 0 0"/><limit lower="-9" upper="9" effort="90" velocity="9"/></joint>'
+        for i in (1, 2)
+    )
+    (folder / "arm.urdf").write_text(f'<robot name="arm"><link name="l0"/>{bodies}{joints}</robot>')
+    drives = {"gear_ratio": 100.0, "motor_inertia": 2.0, "stiffness": 4e4, "damping": 30.0, "viscous_friction": 15.0}
+    own = "".join(f"{key} = {value}\n" for key, value in drives.items())
+    (folder / "robot.toml").write_text(
+        'urdf = "arm.urdf"\n' + "".join(f'[[joint]]\nname = "j{i}"\n{own}' for i in (1, 2))
+    )
+    robot = load_robot(folder)
+    model = build_structure(robot).model
+    data = model.createData()
+
+    def torques(q, v, a):
+        rigid = np.array([pin.rnea(model, data, *x) for x in zip(q, v, a, strict=True)])
+        return rigid + 2.0 * a + 15.0 * v + [COULOMB, 5.0] * np.sign(v) + np.outer(q[:, 1], [0.0, SPRING])
+
+    return recorded(robot, torques)
 
 
 def beside(problem, fit, name, *p):
@@ -78,9 +119,19 @@ def test_the_search_in_motions_stops_where_laws_follow_what_was_driven_alone(wan
     some = {"coulomb_friction", "load_dependent_friction", "cogging", "gravity_spring", "torque_constant"}
     some = [h for h in catalogue(problem.structure, motions_alone=True) if h.effect in some]
     found = attribute(problem, first, hypotheses=some)
-    effects = [e for e in found.final.model.effects if not e.hypothesis.decoy]
-    assert [e.hypothesis.effect for e in effects] == ["coulomb_friction"]
+    assert [e.hypothesis.effect for e in found.final.model.effects] == ["coulomb_friction"]
     assert found.left_share > 0.0 and found.final.chi2_per_dof > 1e3
+
+
+def test_what_follows_no_law_at_one_joint_hides_no_cause_at_another(wandered_arm):
+    problem, first = wandered_arm
+    some = {"coulomb_friction", "cogging", "gravity_spring"}
+    some = [h for h in catalogue(problem.structure, motions_alone=True) if h.effect in some]
+    found = attribute(problem, first, hypotheses=some)
+    effects = {e.hypothesis.key: e.p for e in found.final.model.effects}
+    assert [effect for effect, joint in effects if joint == "j1"] == ["coulomb_friction"]
+    assert effects["coulomb_friction", "j2"][0] == pytest.approx(5.0, rel=0.02)
+    assert effects["gravity_spring", "j2"][0] == pytest.approx(SPRING, rel=0.05)
 
 
 def test_what_is_found_beside_an_error_of_the_model_is_known_as_well_as_that_lets_it(wandered):
