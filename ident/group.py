@@ -41,7 +41,7 @@ class Group:
         periods: (S,) number of periods averaged.
         rest: (S, n_time, n) where motors stand still, or turn.
         Q_fast: (S, F, n) mean spectra of the position beyond lines 0..L-1, as far as they are signal and the time grid
-            reaches; None of a motion.
+            reaches; None where laws along them are not asked for.
         noise_spacing, U_noise, Q_noise: (S, J, n) spectra of noise alone, every so many lines of the period, where a
             single period has no scatter (``ends_of_transients``); or None.
         known_noise: (n,) variances of a line of torque and position by white noise, N2 m2 and rad2, of a single period
@@ -171,14 +171,18 @@ class Group:
 
     @cached_property
     def fast_velocity(self) -> np.ndarray | None:
-        """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps;
-        None of a motion."""
+        """(S, n_time, n) motor velocity in the lines beyond L, rad/s: where dry friction turns the acceleration jumps."""
         if self.Q_fast is None:
             return None
         L, count = len(self.omega), self.Q_fast.shape[1]
         V = np.zeros((len(self.Q_fast), L + count, self.Q_fast.shape[2]), complex)
         V[:, L:] = 2j * np.pi / self.period_time * np.arange(L, L + count)[:, None] * self.Q_fast
         return self.to_time(V)
+
+    @cached_property
+    def velocity(self) -> np.ndarray:
+        """(S, n_time, n) motor velocity in all lines that are known, without those of noise alone, rad/s."""
+        return self.slow_velocity if self.fast_velocity is None else self.slow_velocity + self.fast_velocity
 
     @cached_property
     def torque_share(self) -> np.ndarray:

@@ -205,6 +205,9 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
     link = None
     if segment.q_link is not None:
         link = _lines(close_motion(segment.q_link, n_return, fs, curvature=True)[None], n_lines)
+    # Dry friction turns where the velocity does: of that the compared lines alone know to hundredths of a second.
+    fast = _lines(q[None], min(N // 2, (n_time + 1) // 2))[None, :, n_lines:]
+    white_noise = difference_noise(segment.q) ** 2 / N
     group = Group(
         operating_point=segment.operating_point or segment.name,
         segments=(segment.name,),
@@ -222,8 +225,9 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
         start=np.array([began[segment.name]]),
         period_time=N / fs,
         periods=np.ones(1, int),
-        white_noise=difference_noise(segment.q) ** 2 / N,
+        white_noise=white_noise,
         white_torque_noise=difference_noise(segment.tau) ** 2 / N,
+        Q_fast=signal_power(fast, white_noise),
         link_std=None if segment.q_link is None else difference_noise(segment.q_link),
         n_slow=n_slow,
         rest=at_rest(segment.q, fs, REST_TIME)[None, np.minimum((time * fs).astype(int), len(segment.t) - 1)],

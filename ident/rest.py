@@ -7,7 +7,7 @@ import scipy.ndimage
 
 from ident.group import Group
 
-REST_TIME, REST_SAMPLES = 0.05, 5  # s, and samples at least, within which a motor that stands still does not move
+REST_TIME, REST_SAMPLES = 0.01, 5  # s, and samples at least, within which a motor that stands still does not move
 REST_NOISE = 6.0  # beyond this many standard deviations of its noise
 
 
@@ -43,7 +43,7 @@ def slow(group: Group) -> np.ndarray:
 
     Positions may differ by no more than noise where a motor moves slowly, and its direction is known.
     """
-    return np.abs(group.slow_velocity) < group.least_velocity[:, None]
+    return np.abs(group.velocity) < group.least_velocity[:, None]
 
 
 def turning(group: Group) -> np.ndarray:
@@ -51,8 +51,7 @@ def turning(group: Group) -> np.ndarray:
 
     Dry friction jumps there, and with it the acceleration: in a motion whose lines end the velocity turns too late.
     """
-    v = group.slow_velocity + group.fast_velocity
-    turns = v * np.roll(v, -1, axis=1) <= 0.0
+    turns = group.velocity * np.roll(group.velocity, -1, axis=1) <= 0.0
     return turns | np.roll(turns, 1, axis=1)
 
 

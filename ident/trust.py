@@ -161,12 +161,18 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
 def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
     """Whether the data tell the size of what makes an effect the one that it is named, to about a factor of ``e``.
 
-    Where each parameter has a value at which the effect is none, all of them together must be further from there than
+    One that makes it by exceeding another must do so beyond chance. Where each parameter has a value at which the effect is none, all of them together must be further from there than
     chance brings them (Wald 1943): a cause that has explained much while others were missing may be nothing beside
     these.
     """
     h = effect.hypothesis
     at = [final.names.index(h.coordinate(q.name)) for q in h.parameters]
+    if "exceeds" in h.options:
+        pair = [final.names.index(h.coordinate(name)) for name in h.options["exceeds"]]
+        larger, smaller = (effect.value(name) for name in h.options["exceeds"])
+        off = np.array([1.0, -1.0])
+        if np.log(larger / smaller) < CHANCE * np.sqrt(off @ covariance[np.ix_(pair, pair)] @ off):
+            return False
     if "shown" in h.options:
         i = final.names.index(h.coordinate(h.options["shown"]))
         return bool(covariance[i, i] < UNTOLD**2)

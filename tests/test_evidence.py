@@ -1214,6 +1214,14 @@ def test_a_hysteresis_of_which_no_yielding_is_seen_is_not_trusted(named, std, tr
     assert shown(Effect(rub, np.array([5.0, 0.0, 1e-3])), final, covariance)
 
 
+@pytest.mark.parametrize(("std", "trusted"), [(0.1, True), (0.8, False)])
+def test_a_friction_is_larger_at_rest_only_where_that_is_more_than_chance(named, std, trusted):
+    dips = named["stribeck_friction", "elbow_joint"]
+    final = SimpleNamespace(names=[dips.coordinate(q.name) for q in dips.parameters])
+    covariance = np.diag([1e-6, std**2, 0.1, 0.1, 0.1])
+    assert shown(Effect(dips, np.array([2.5, 4.9, 0.03, 1e-3, 2.0])), final, covariance) == trusted
+
+
 @pytest.mark.parametrize(("off", "trusted"), [(0.5, False), (2.0, True)])
 def test_a_body_is_another_only_where_its_figures_together_say_so(named, off, trusted):
     """Each of five figures at most two deviations from that of the model, two of which would go together by chance and

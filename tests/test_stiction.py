@@ -29,6 +29,7 @@ from ident.refits import either_turn, refit
 from ident.stiction import LEFT_HELD, as_held, held, held_share
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
+from tests.conftest import through_postures
 
 FS, PERIOD, PERIODS, STEPS = 1000.0, 2000, 3, 16
 MOTOR, LOAD, SPRING, DAMPER, VISCOUS = 0.004, 0.00477, 380.0, 0.03, 0.02
@@ -156,6 +157,36 @@ def test_friction_that_sticks_is_named(static):
         assert found["static"].value == pytest.approx(STATIC, rel=0.05)
         assert found["stribeck_velocity"].value == pytest.approx(STRIBECK, rel=0.15)
     assert verdict.gain.gap_closed > 0.95
+
+
+def test_where_friction_turns_along_a_motion_looks_like_no_other_cause():
+    """The motor rests for hundredths of a second wherever it turns, far longer than lines of the compared band show."""
+    bench, segments = load_robot("twomass"), []
+    for i, role in enumerate(("identification", "validation")):
+        rng = np.random.default_rng(60 + i)
+        t, q, _, _ = through_postures(rng, 1, FS, 30.0)
+        reference = 4.0 * q[:, 0]
+        noise = NOISE[0] * rng.normal(size=len(t))
+        tau, q, stuck = run_bench(reference, np.zeros(len(t)), COULOMB, COULOMB, STRIBECK, noise, reference[0])
+        assert 0.0 < stuck.mean() < 0.2
+        tau, q = (x[::2, None] for x in (tau + 1e-3 * rng.normal(size=len(t)), q))
+        segments.append(Segment(name=f"m{i}", role=role, kind="trajectory", t=t[::2], tau=tau, q=q))
+    data = Dataset(
+        name="turns",
+        robot=bench,
+        sample_rate=FS / 2,
+        joints=bench.joint_names,
+        input_hold="none",
+        q_std=None,
+        tau_std=None,
+        controller=None,
+        segments=tuple(segments),
+    )
+    verdict = diagnose(data)
+    (cause,) = [c for c in verdict.causes if c.probability > 0.5]
+    assert cause.effect == "coulomb_friction" and cause.probability > 0.9
+    assert cause.parameters["torque"].value == pytest.approx(COULOMB, rel=0.02)
+    assert all(c.probability < 0.3 for c in verdict.causes if c is not cause)
 
 
 def test_what_rest_leaves_of_noise():

@@ -220,6 +220,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "absorb": absorb,
             "apart": "stribeck_velocity",
             "shown": "static",
+            "exceeds": ("static", "coulomb"),
             "special": lambda p: np.array([p[0], 0.0, p[3]]),
             "dry": True,
             "trivial": lambda p, k: not LEAST_DIP * p[0] < p[1] < MOST_DIP * p[0],

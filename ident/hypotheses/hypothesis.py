@@ -139,6 +139,7 @@ class Hypothesis:
             one of the chain moves the arm to another posture.
             ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a
             spring.
+            ``exceeds``: two positive parameters, of which the first must be larger beyond chance.
             ``filter(p, s)``: recorded torque per delivered one, or true position per measured one, of one that is
                 linear, (L,).
             ``slope(p, q)``: of one that is not, true position per measured one at true positions; of a spring to the
