@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from types import MappingProxyType
 
 import numpy as np
 
+from ident.convert.guess_order import Names, called, columns_by_names
 from ident.convert.guess_units import Family
 from ident.convert.spelling import split_unit
 from robot_assets.robot import Robot
@@ -90,11 +92,14 @@ def _split(word: str) -> tuple[str, ...]:
     return (word,)
 
 
-def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robot) -> list[Family]:
+def families_of(
+    signals: dict[str, np.ndarray], units: dict[str, str], arm: Robot, lists: Names = MappingProxyType({})
+) -> list[Family]:
     """Arrays of a column a joint, single columns numbered or named by joint, and what is left alone.
 
     Args:
         units: name -> unit, of those for which the log says it apart from the name.
+        lists: lists of strings in the log, which may name the columns of its arrays.
     """
     n, out, single = arm.n, [], {}
     stems, own = {}, dict(units)
@@ -106,7 +111,9 @@ def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robo
         if x.shape[1] == 1:
             single[name] = x[:, 0]
         elif x.shape[1] >= n:
-            out.append(Family(name, words_of(stems[name]), tuple((name, j) for j in range(n)), x[:, :n], own.get(name)))
+            columns, note = columns_by_names(name, x.shape[1], lists, arm.joint_names)
+            sources = tuple((name, k) for k in columns)
+            out.append(Family(name, words_of(stems[name]), sources, x[:, list(columns)], own.get(name), note))
 
     def alone(name: str) -> Family:
         return Family(name, words_of(stems[name]), ((name, None),), single[name][:, None], own.get(name))
@@ -116,9 +123,9 @@ def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robo
     sets: dict[tuple[str, str | None], dict[int, str]] = {}
     for name in single:
         stem, unit = stems[name], own.get(name)
-        for joint, called in _called(arm.joint_names):
-            if called in stem:
-                sets.setdefault((stem.replace(called, "{}", 1), unit), {})[arm.joint_names.index(joint)] = name
+        for joint, name_of in called(arm.joint_names):
+            if name_of in stem:
+                sets.setdefault((stem.replace(name_of, "{}", 1), unit), {})[arm.joint_names.index(joint)] = name
                 break
         for m in re.finditer(r"\d+", stem):
             sets.setdefault((stem[: m.start()] + "{#}" + stem[m.end() :], unit), {})[int(m[0])] = name
@@ -142,18 +149,6 @@ def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robo
         words = words or tuple(dict.fromkeys(w for other in own_words for w in other))
         joined(f"{names[0]} .. {names[-1]}", words, names, "EDIT? joints in the order of the columns")
     return out + [alone(k) for k in single if k not in used]
-
-
-def _called(joints: tuple[str, ...]) -> list[tuple[str, str]]:
-    """(joint, how a log may call it): its name, and what sets it apart from the others; longer ones first, as
-    "joint_1" is also part of "joint_10"."""
-    out = {name: name for name in joints}
-    parts = {name: name.split("_") for name in joints}
-    for name in joints if len(joints) > 1 else ():
-        short = "_".join(p for p in parts[name] if not all(p in other for other in parts.values()))
-        if len(short) > 2 and words_of(short):
-            out.setdefault(short, name)
-    return sorted(((joint, called) for called, joint in out.items()), key=lambda pair: -len(pair[1]))
 
 
 def _alike(names: list[str], stems: dict[str, str], units: dict[str, str], n: int) -> list[list[str]]:

@@ -121,7 +121,8 @@ def render(
                 *([] if index is None or index == j else [f"index = {index}"]),
                 *options,
             ]
-            if channel != "temp" and np.ptp(family.x[:, j]) == 0 and channel not in ("tau", "q"):
+            # Only encoders at the link may be at some joints alone.
+            if channel == "q_link" and np.ptp(family.x[:, j]) == 0:
                 lines.append(f"# {channel}_{j + 1} is constant in the log")
                 continue
             lines.append(f"{'# ' if broken else ''}{channel}_{j + 1} = {{ {', '.join(options)} }}")

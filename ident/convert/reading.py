@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from robot_assets.errors import DataError
 DEEPEST = 8  # structures inside structures that are looked into
 MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
 MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
+LONGEST_NAME = 200  # characters
 NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
 Signals = dict[str, np.ndarray]
 Reader = Callable[[Path, set[str] | None], dict[str, Any]]
@@ -37,6 +38,7 @@ class Survey:
         dates: names of those that are dates or times of the day.
         doubts: name -> what is doubtful about how it was read, in words; of those left out as well.
         cut: rows that were read of a log that is longer; else 0.
+        lists: name -> strings of a list of them, which may name columns; empty where it changes from row to row.
     """
 
     signals: Signals
@@ -44,6 +46,7 @@ class Survey:
     dates: frozenset[str]
     doubts: dict[str, str]
     cut: int = 0
+    lists: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Signals:
@@ -75,13 +78,15 @@ def survey_log(path: Path) -> Survey:
         DataError: where the file is missing, of another format or unreadable.
     """
     signals: Signals = {}
-    dates, doubts = set(), {}
+    dates, doubts, lists = set(), {}, {}
     rows = [0]
     text = READERS.get(path.suffix.lower()) is read_text
     for name, value in (
         _read(path, None, lambda p, _: _surveyed(p, doubts, rows)) if text else _read(path, None)
     ).items():
         x = _array(value)
+        if (strings := _strings(value)) is not None:
+            lists[name] = strings
         if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
         if x.dtype.kind in "Mm":
@@ -89,7 +94,7 @@ def survey_log(path: Path) -> Survey:
             stamps = x.ravel()[~np.isnat(x.ravel())]
             x = seconds(x, stamps[0]) if len(stamps) else np.zeros(0)
         signals[name] = x.astype(float)
-    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0])
+    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0], lists)
 
 
 def _surveyed(path: Path, doubts: dict[str, str], rows: list[int]) -> dict[str, Any]:
@@ -119,6 +124,21 @@ def _array(value: Any) -> np.ndarray | None:
         return dates_of_texts(x) if x.ndim == 1 and x.dtype.kind in "UO" and isinstance(next(iter(x), None), str) else x
     except (TypeError, ValueError, pa.ArrowException):
         return None
+
+
+def _strings(x: Any) -> tuple[str, ...] | None:
+    """The strings of a short list, or of one a row where all are alike; () where they are not; None of all else."""
+    if (
+        not isinstance(x, np.ndarray)
+        or x.dtype.kind not in "US"
+        or not 0 < x.ndim < 3
+        or x.shape[-1] > MOST_ELEMENTS
+        or (x.ndim == 2 and not len(x))
+    ):
+        return None
+    rows = np.atleast_2d(x)
+    names = rows[0].astype(str) if np.all(rows == rows[0]) else ()
+    return tuple(str(name).strip() for name in names)
 
 
 def _instead(x: np.ndarray | None) -> str:
@@ -175,7 +195,33 @@ def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         n: _lists(table.column(n)) if _is_list(table.column(n).type) else as_dates(table.column(n))
         for n in table.column_names
     }
+    if wanted is None:
+        out |= {
+            n: _names(file, n)
+            for n in schema.names
+            if _is_list(kind := schema.field(n).type) and _is_text(kind.value_type)
+        }
     return {n: x for n, x in out.items() if x is not None or wanted is not None}
+
+
+def _names(file: pa.parquet.ParquetFile, name: str) -> np.ndarray | None:
+    """(k,) strings of a list of them that is the same in all rows, as messages name their joints; none where it
+    changes; None where there are too many for joints."""
+    first = None
+    for batch in file.iter_batches(batch_size=1024, columns=[name]):
+        column = batch.column(0)
+        if column.null_count or pc.any(pc.not_equal(pc.list_value_length(column), len(column[0]))).as_py():
+            return np.array([], str)
+        k = len(column[0])
+        if not 0 < k <= MOST_ELEMENTS:
+            return None
+        codes = pc.list_flatten(column).cast(pa.string()).dictionary_encode()
+        names = np.array([str(v) for v in column[0].as_py()])
+        first = names if first is None else first
+        rows = codes.indices.to_numpy(zero_copy_only=False).reshape(-1, k)
+        if not np.array_equal(names, first) or np.any(rows != rows[0]):
+            return np.array([], str)
+    return first
 
 
 def _lists(column: pa.ChunkedArray) -> np.ndarray | None:
@@ -189,6 +235,12 @@ def _lists(column: pa.ChunkedArray) -> np.ndarray | None:
 
 def _is_list(kind: pa.DataType) -> bool:
     return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind.value_type if pa.types.is_dictionary(kind) else kind) or pa.types.is_large_string(
+        kind
+    )
 
 
 def _holds_numbers(kind: pa.DataType) -> bool:
@@ -236,6 +288,8 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         if hasattr(value, "_fieldnames"):
             for key in value._fieldnames if depth < DEEPEST else []:
                 walk(f"{name}.{key}", getattr(value, key), depth + 1)
+        elif _cells_of_texts(value):
+            out[name] = value.ravel().astype(str)
         elif isinstance(value, np.ndarray) and value.dtype == object and value.size and depth < DEEPEST:
             for key, part in _elements(name, value.ravel()):
                 walk(key, part, depth + 1)
@@ -248,6 +302,12 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return out
 
 
+def _cells_of_texts(value: Any) -> bool:
+    """Whether a value of a MATLAB file is a short list of texts, which may name columns."""
+    cells = isinstance(value, np.ndarray) and value.dtype == object and 0 < value.size <= MOST_ELEMENTS
+    return cells and all(isinstance(v, str) for v in value.ravel())
+
+
 def _elements(name: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
     """Parts of an array of structures or cells, named as MATLAB does; a structure a sample is an array a field."""
     structures = hasattr(array[0], "_fieldnames")
@@ -255,10 +315,10 @@ def _elements(name: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
         brackets = "()" if structures else "{}"
         yield from ((f"{name}{brackets[0]}{k + 1}{brackets[1]}", part) for k, part in enumerate(array))
         return
-    for field in array[0]._fieldnames if structures else ():
-        parts = [np.asarray(getattr(part, field, None)) for part in array]
+    for key in array[0]._fieldnames if structures else ():
+        parts = [np.asarray(getattr(part, key, None)) for part in array]
         if all(p.shape == parts[0].shape and p.dtype.kind in "fiu" for p in parts):
-            yield f"{name}.{field}", np.stack(parts)
+            yield f"{name}.{key}", np.stack(parts)
 
 
 def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
@@ -266,6 +326,7 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
     import h5py
 
     found: dict[str, Any] = {}
+    texts: dict[str, np.ndarray] = {}
     groups, items = set(), 0
 
     def walk(group: Any, start: str, depth: int) -> None:
@@ -288,6 +349,8 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
                 text = item.attrs.get("MATLAB_class", b"") == b"char"
                 if not text and not item.attrs.get("MATLAB_empty", 0):
                     found[dotted] = item
+            elif isinstance(item, h5py.Dataset) and wanted is None and (cells := _hdf5_texts(file, item)) is not None:
+                texts[dotted] = cells
 
     walk(file, "", 0)
     for name, item in found.items():
@@ -295,7 +358,21 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
             raise DataError("signal", str(path), f"{name}, which stands in another file", "one in the file itself")
     check_size(path, sum(item.size * item.dtype.itemsize for item in found.values()))
     # MATLAB's first dimension is the file's last.
-    return {name: np.asarray(item).T for name, item in found.items()}
+    return texts | {name: np.asarray(item).T for name, item in found.items()}
+
+
+def _hdf5_texts(file: Any, item: Any) -> np.ndarray | None:
+    """(k,) texts of the cells of a MATLAB 7.3 file, which refer to them; None where they are none, or too many."""
+    import h5py
+
+    if item.dtype != h5py.ref_dtype or item.external or item.is_virtual or not 0 < item.size <= MOST_ELEMENTS:
+        return None
+    parts = [file[ref] if ref else None for ref in np.asarray(item).ravel()]
+    if not all(isinstance(p, h5py.Dataset) and p.attrs.get("MATLAB_class", b"") == b"char" for p in parts):
+        return None
+    if any(p.external or p.is_virtual or p.size > LONGEST_NAME for p in parts):
+        return None
+    return np.array(["".join(map(chr, np.asarray(p).ravel())) for p in parts])
 
 
 def _mcap(path: Path, wanted: set[str] | None) -> dict[str, Any]:
