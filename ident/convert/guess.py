@@ -74,6 +74,12 @@ def guess_map(
         for k, text in s.units.items()
         if (u := unit_of(text.strip("[](){}<> ")))
     }
+    unread = {
+        f"{p}{k}": bare
+        for p, s in zip(starts, surveys)
+        for k, text in s.units.items()
+        if f"{p}{k}" not in units and (bare := text.strip("[](){}<> "))
+    }
     dates = {f"{p}{k}" for p, s in zip(starts, surveys) for k in s.dates}
     damaged = {
         f"{p}{k}": int(bad[0]) + 1
@@ -94,7 +100,7 @@ def guess_map(
     lists = {f"{p}{k}": names for p, s in zip(starts, surveys) for k, names in s.lists.items()}
     if not parts:
         warnings += _other_orders(paths, [s.lists for s in surveys])
-    families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm, lists)
+    families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm, lists, unread)
     time = (
         FoundTime(rate=min(c.rate for c in clocks.values()))
         if clocks

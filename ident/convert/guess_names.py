@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
 
 from ident.convert.guess_order import Names, called, columns_by_names
 from ident.convert.guess_units import Family
-from ident.convert.spelling import split_unit
+from ident.convert.spelling import split_unit, unread_unit
 from robot_assets.robot import Robot
 
 CHANNELS = ("tau", "q", "qd", "q_ref", "q_link", "temp")
@@ -93,16 +94,28 @@ def _split(word: str) -> tuple[str, ...]:
 
 
 def families_of(
-    signals: dict[str, np.ndarray], units: dict[str, str], arm: Robot, lists: Names = MappingProxyType({})
+    signals: dict[str, np.ndarray],
+    units: dict[str, str],
+    arm: Robot,
+    lists: Names = MappingProxyType({}),
+    unread: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Family]:
     """Arrays of a column a joint, single columns numbered or named by joint, and what is left alone.
 
     Args:
         units: name -> unit, of those for which the log says it apart from the name.
         lists: lists of strings in the log, which may name the columns of its arrays.
+        unread: name -> unit as the log writes it, of those that are none of a map.
     """
     n, out, single = arm.n, [], {}
     stems, own = {}, dict(units)
+
+    def strange(*names: str) -> str:
+        rows = " or ".join(dict.fromkeys(unread[k] for k in names if k in unread))
+        # Where it sets the columns of a quantity apart it is no unit.
+        told = {"" if k in own else _strange(k, arm) for k in names}
+        return rows or (told.pop() if len(told) == 1 else "")
+
     for name, x in signals.items():
         stems[name], unit = split_unit(name)
         if unit is not None:
@@ -113,10 +126,15 @@ def families_of(
         elif x.shape[1] >= n:
             columns, note = columns_by_names(name, x.shape[1], lists, arm.joint_names)
             sources = tuple((name, k) for k in columns)
-            out.append(Family(name, words_of(stems[name]), sources, x[:, list(columns)], own.get(name), note))
+            out.append(
+                Family(
+                    name, words_of(stems[name]), sources, x[:, list(columns)], own.get(name), note, unread=strange(name)
+                )
+            )
 
     def alone(name: str) -> Family:
-        return Family(name, words_of(stems[name]), ((name, None),), single[name][:, None], own.get(name))
+        words, source = words_of(stems[name]), ((name, None),)
+        return Family(name, words, source, single[name][:, None], own.get(name), unread=strange(name))
 
     if n == 1:
         return out + [alone(k) for k in single]
@@ -134,7 +152,17 @@ def families_of(
     def joined(name: str, words: tuple[str, ...], members: list[str], note: str = "") -> None:
         used.update(members)
         columns = np.stack([single[k] for k in members], axis=1)
-        out.append(Family(name, words, tuple((k, None) for k in members), columns, own.get(members[0]), note))
+        out.append(
+            Family(
+                name,
+                words,
+                tuple((k, None) for k in members),
+                columns,
+                own.get(members[0]),
+                note,
+                unread=strange(*members),
+            )
+        )
 
     for (stem, _), members in sets.items():
         first = 0 if 0 in members or "{#}" not in stem else 1
@@ -149,6 +177,14 @@ def families_of(
         words = words or tuple(dict.fromkeys(w for other in own_words for w in other))
         joined(f"{names[0]} .. {names[-1]}", words, names, "EDIT? joints in the order of the columns")
     return out + [alone(k) for k in single if k not in used]
+
+
+def _strange(name: str, arm: Robot) -> str:
+    """What stands in the place of a unit in a name, is none of a map and says nothing else; empty where there is none."""
+    text = unread_unit(name) or ""
+    vocabulary = {w for table in WORDS.values() for w in table} | {*REFERENCE, *LINK, *MOTOR, *ACTUAL, *DERIVED}
+    told = {text.lower(), *words_of(text)} & (vocabulary | {short.lower() for _, short in called(arm.joint_names)})
+    return "" if told else text
 
 
 def _alike(names: list[str], stems: dict[str, str], units: dict[str, str], n: int) -> list[list[str]]:

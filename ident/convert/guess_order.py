@@ -67,7 +67,10 @@ def columns_by_names(signal: str, width: int, lists: Names, joints: tuple[str, .
         return columns, f"columns by their names in {name} of the log"
     if fitting and len(joints) > 1:
         name, names = next(iter(fitting.items()))
-        return first, f"EDIT: joints in the order of the columns, which {name} of the log calls {', '.join(names)}"
+        return (
+            first,
+            f"EDIT: joints in the order of the columns, which {name} of the log calls {', '.join(names)[:300]}",
+        )
     changing = next((k for k, v in near.items() if not v), None)
     if changing is not None and len(joints) > 1:
         return first, f"EDIT: joints in the order of the columns, whose names in {changing} change from row to row"
