@@ -11,7 +11,7 @@ import scipy.io
 
 from ident.convert import convert_logs
 from ident.convert.guess import guess_map
-from ident.convert.reading import list_signals
+from ident.convert.reading import list_signals, survey_log
 from ident.convert.spelling import split_unit, unit_of
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -301,3 +301,20 @@ def test_a_log_in_which_nothing_is_recognised_is_an_error_and_leaves_no_map(tmp_
     (line,) = result.stderr.strip().splitlines()
     assert result.returncode == 2 and "nothing that looks like" in line and "thing 2" in line
     assert not (tmp_path / "map.toml").exists() and not result.stdout
+
+
+@pytest.mark.parametrize("state", ["OK", "run / hold", "", "m"])
+@pytest.mark.parametrize("below", ["ms;°;mNm;", "[ms];[°];[mNm];-", "ms;°;mNm;text", ";°;mNm;"])
+def test_units_are_read_below_a_header_where_a_column_holds_texts(tmp_path, state, below):
+    log = written(
+        tmp_path / "log.csv", {"t": T, "a": Q[:, 0], "b": TAU[:, 0], "Status": [state] * N}, ";", "", f"{below}\n"
+    )
+    survey = survey_log(log)
+    assert np.allclose(survey.signals["a"], Q[:, 0]) and len(survey.signals["a"]) == N
+    assert survey.units["a"] == below.split(";")[1] and survey.units["b"] == below.split(";")[2]
+
+
+def test_a_first_row_of_a_text_alone_is_no_row_of_units(tmp_path):
+    log = written(tmp_path / "log.csv", {"t": T, "a": Q[:, 0], "mode": ["A"] * N}, below=",,A\n")
+    survey = survey_log(log)
+    assert not survey.units and len(survey.signals["a"]) == N + 1

@@ -82,8 +82,8 @@ def read_layout(path: Path) -> Layout:
         units = said.pop() if len(said) == 2 and _units(said[1]) else ()
         names = said[-1] if said else ()
     else:
-        below = _words(rows[1], delimiter) if len(rows) > 2 and _row(_words(rows[2], delimiter)) else ()
-        units = below if len(below) == len(words) and _units(below) else ()
+        below, first_row = (_words(r, delimiter) for r in rows[1:3]) if len(rows) > 2 else ((), ())
+        units = below if len(below) == len(words) and _units(below) and _units_above(below, first_row) else ()
         start += 1 + bool(units)
     columns = len(words)
     written = [w for r in rows[start - skipped :][:-1] if not _comment(r) and any(w := _words(r, delimiter))]
@@ -179,3 +179,8 @@ def _value(word: str) -> bool:
 def _units(words: tuple[str, ...]) -> bool:
     """Whether words are units: one is known, and none is a number."""
     return any(unit_of(w.strip("[](){}<> ")) for w in words) and not any(_value(w) for w in words if w)
+
+
+def _units_above(units: tuple[str, ...], row: tuple[str, ...]) -> bool:
+    """Whether a row of numbers, some of which may be texts, stands below units: one that is known is above a number."""
+    return _row(row) or any(unit_of(u.strip("[](){}<> ")) and _value(x) for u, x in zip(units, row, strict=False))
