@@ -318,3 +318,52 @@ def test_a_first_row_of_a_text_alone_is_no_row_of_units(tmp_path):
     log = written(tmp_path / "log.csv", {"t": T, "a": Q[:, 0], "mode": ["A"] * N}, below=",,A\n")
     survey = survey_log(log)
     assert not survey.units and len(survey.signals["a"]) == N + 1
+
+
+def scope(path, times, end=""):
+    """As TwinCAT's Scope writes tables: a time before each channel, and a key before each word above them."""
+    channels = {
+        f"GVL.Axis{j + 1}.{k}": x[:, j]
+        for k, x in {"ActPos": np.rad2deg(Q), "ActTorque": TAU}.items()
+        for j in range(6)
+    }
+    units = ["deg"] * 6 + ["Nm"] * 6
+    above = ["Name\tScope Project", "File\tC:\\run.svdx", "Starttime of export\t133765432100000000", ""]
+    above.append("\t".join(f"Name\t{name}" for name in channels) + end)
+    above.append("SymbolComment" + "\t" * 23)
+    above.append("\t".join(f"Unit\t{unit}" for unit in units))
+    above += ["\t".join(["SampleTime[ms]\t2"] * 12), ""]
+    cells = np.stack([x for pair in zip(times, channels.values(), strict=True) for x in pair], axis=1)
+    rows = ["\t".join(f"{x:.15g}" for x in row) + end for row in cells]
+    path.write_text("\n".join([*above, *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("end", ["", "\t"])
+def test_a_table_with_a_time_before_each_channel_is_read(tmp_path, end):
+    guessed, data = converted(scope(tmp_path / "scope.csv", [1e3 * T] * 12, end))
+    assert guessed.found["time"] == "Time, 500 Hz" and tomllib.loads(guessed.text)["time"]["unit"] == "ms"
+    assert tomllib.loads(guessed.text)["columns"]["tau_2"] == {"source": "GVL.Axis2.ActTorque", "unit": "N m"}
+    assert np.allclose(whole(data, "q"), Q) and np.allclose(whole(data, "tau"), TAU)
+
+
+def test_times_of_channels_that_differ_are_refused(tmp_path):
+    log = scope(tmp_path / "scope.csv", [1e3 * T] * 11 + [1e3 * T + 1])
+    assert "EDIT? several columns that differ" in guess_map([log], "ur10_bare").text
+    with pytest.raises(DataError, match=r"Time twice, and the columns differ.*one time for all"):
+        converted(log)
+
+
+def test_a_column_that_is_repeated_is_read_once_and_others_of_one_name_are_refused(tmp_path):
+    log, given = tmp_path / "log.csv", tmp_path / "map.toml"
+    given.write_text(f'sample_rate = {RATE}\n[time]\nsource = "t"\n{BENCH}')
+    for second, good in ((T, True), (T + 1e-3, False)):
+        rows = "\n".join(
+            f"{a:.9g},{b:.9g},{c:.9g},{d:.9g}" for a, b, c, d in zip(T, TAU[:, 0], second, Q[:, 0], strict=True)
+        )
+        log.write_text(f"t,u,t,x\n{rows}\n")
+        if good:
+            assert np.allclose(whole(convert_logs([log], "twomass", given), "q")[:, 0], Q[:, 0])
+        else:
+            with pytest.raises(DataError, match="t twice, and the columns differ"):
+                convert_logs([log], "twomass", given)

@@ -15,7 +15,7 @@ import pyarrow.parquet
 
 from ident.convert.dates import as_dates, dates_of_texts, seconds
 from ident.convert.layout import read_layout
-from ident.convert.texts import MOST_CELLS, distinct, read_text, scan_text, text_names, text_units
+from ident.convert.texts import MOST_CELLS, alike, distinct, read_text, scan_text, text_names, text_units
 from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
@@ -109,7 +109,12 @@ def _surveyed(path: Path, doubts: dict[str, str], rows: list[int]) -> dict[str, 
             doubts[c.name] = f"{c.fault[1][:40]!r} in row {c.fault[0]}"
         elif c.order[1]:
             doubts[c.name] = f"{c.like!r} taken as {'month/day' if c.order[0] == 'mdy' else 'day-month'}"
-    return {c.name: x for c in cells if (x := c.array()) is not None}
+    out: dict[str, np.ndarray] = {}
+    for c in cells:
+        x = c.array()
+        if x is not None and not alike(out.setdefault(c.name, x), x):
+            doubts[c.name] = "several columns that differ"
+    return out
 
 
 def list_signals(path: Path) -> Signals:
