@@ -367,3 +367,52 @@ def test_a_column_that_is_repeated_is_read_once_and_others_of_one_name_are_refus
         else:
             with pytest.raises(DataError, match="t twice, and the columns differ"):
                 convert_logs([log], "twomass", given)
+
+
+ROWS_OF = {"names": load_robot("ur10_bare").joint_names, "counted": range(1, 7), "counted from 0": range(6)}
+
+
+def long(folder, kind, names, by_joint=False):
+    """A table with a row for each joint and time."""
+    at = np.arange(6 * N)
+    j, k = (at // N, at % N) if by_joint else (at % 6, at // 6)
+    cells = [str(names[i]) for i in j]
+    if kind == "csv":
+        return written(folder / "log.csv", {"t": T[k], "joint": cells, "position": Q[k, j], "torque": TAU[k, j]})
+    joint = pa.array(cells).dictionary_encode() if kind == "parquet categories" else pa.array(cells)
+    joint = joint if isinstance(names, tuple) else joint.cast(pa.int64())
+    pq.write_table(
+        pa.table({"t": T[k], "joint": joint, "position": Q[k, j], "torque": TAU[k, j]}), folder / "log.parquet"
+    )
+    return folder / "log.parquet"
+
+
+@pytest.mark.parametrize("by_joint", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "rows"),
+    [("csv", "names"), ("csv", "counted"), ("csv", "counted from 0"), ("parquet", "names"), ("parquet categories", "names"), ("parquet", "counted")],
+)  # fmt: skip
+def test_rows_of_one_joint_each_are_refused_with_the_column_that_names_it(tmp_path, kind, rows, by_joint):
+    log = long(tmp_path, kind, ROWS_OF[rows], by_joint)
+    with pytest.raises(DataError, match=r"rows of one joint each: joint holds .*pivot the table by joint"):
+        guess_map([log], "ur10_bare")
+    columns = "".join(f'q_{j + 1} = "position"\ntau_{j + 1} = "torque"\n' for j in range(6))
+    (tmp_path / "map.toml").write_text(f'sample_rate = {RATE}\n[time]\nsource = "t"\n[columns]\n{columns}')
+    with pytest.raises(DataError, match="a stamp that goes back" if by_joint else "pivot a table of one joint a row"):
+        convert_logs([log], "ur10_bare", tmp_path / "map.toml")
+
+
+def test_a_coarse_clock_is_no_table_of_rows_of_one_joint(tmp_path):
+    log, given = (
+        written(tmp_path / "log.csv", {"t": np.floor(T * 250) / 250, "u": TAU[:, 0], "x": Q[:, 0]}),
+        tmp_path / "m.toml",
+    )
+    given.write_text(f'sample_rate = 250.0\n[time]\nsource = "t"\n{BENCH}')
+    (s,) = convert_logs([log], "twomass", given).segments
+    assert np.allclose(s.q[:, 0], Q[::2, 0], atol=1e-9)
+
+
+def test_a_log_without_signals_of_joints_is_told_as_before(tmp_path):
+    log = written(tmp_path / "log.csv", {"t": T, "state": ["run"] * N, "position": Q[:, 0]})
+    with pytest.raises(DataError, match="nothing that looks like a position or a torque of 6 joints"):
+        guess_map([log], "ur10_bare")

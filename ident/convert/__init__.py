@@ -9,7 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
+from ident.convert.clock import (
+    Stamps,
+    at_times,
+    changed,
+    check_rows,
+    check_stamps,
+    resample,
+    stamp_seconds,
+    uniform_times,
+)
 from ident.convert.joining import on_one_clock
 from ident.convert.mapping import Column, LogMap, read_map
 from ident.convert.reading import read_log
@@ -176,6 +185,7 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
                 raise DataError(source, str(path), f"{len(other)} values", f"one for each of {N} samples")
             seconds = seconds + stamp_seconds(other, factor, other[0])
         clock = check_stamps(seconds, m.sample_rate, path)
+        check_rows(clock, channels["q"], path)
         clocks, t = [clock], uniform_times(0.0, float(clock.t[-1]), m.sample_rate)
         if not at_times(clock, t, m.sample_rate):
             rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ident.convert.guess_names import choose, families_of, oriented, score, words_of
-from ident.convert.guess_order import Names
+from ident.convert.guess_order import Names, joint_column
 from ident.convert.guess_text import plain, render
 from ident.convert.guess_time import FileClock, FoundTime, find_time
 from ident.convert.guess_units import guess_scales, unwrapped
@@ -108,6 +108,14 @@ def guess_map(
     )
     chosen, others = choose([f for f in families if f.x.shape[1] == arm.n and f.name not in time.sources | dates], arm)
     if not {"tau", "q"} & set(chosen):
+        long = joint_column(surveys[0].labels, surveys[0].signals, arm.joint_names) if arm.n > 1 else None
+        if long is not None:
+            raise DataError(
+                "rows",
+                str(paths[0]),
+                f"rows of one joint each: {plain(long[0])} holds {plain(long[1])}",
+                f"a row for each time with columns for all joints: pivot the table by {plain(long[0])}",
+            )
         names = ", ".join(plain(f.name) for f in families if f.name not in time.sources)
         raise DataError(
             "signals",
@@ -143,7 +151,7 @@ def _length(x: np.ndarray) -> int:
 def _other_orders(paths: list[Path], lists: list[Names]) -> list[str]:
     """Of logs each, those that name their columns otherwise than the first, from which the map is guessed."""
     return [
-        f"{path.name}: {name} lists other names than in {paths[0].name}: it needs a map of its own"
+        f"{path.name}: {plain(name)} lists other names than in {paths[0].name}: it needs a map of its own"
         for path, own in zip(paths[1:], lists[1:], strict=True)
         for name in own
         if own[name] != lists[0].get(name, own[name])

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
+import numpy as np
+
+# In the name of a column that counts joints.
+COUNTED = re.compile(r"(?i)joint|axis|axes|achse|gelenk|motor|drive|(?<![a-z])(id|nr|index)(?![a-z])")
 Names = Mapping[str, tuple[str, ...]]
 
 
@@ -37,6 +42,24 @@ def columns_of_joints(names: tuple[str, ...], joints: tuple[str, ...]) -> tuple[
             return None
         out.append(found[0])
     return tuple(out) if len(set(out)) == len(out) else None
+
+
+def joint_column(labels: Names, signals: Mapping[str, np.ndarray], joints: tuple[str, ...]) -> tuple[str, str] | None:
+    """(name, what it holds) of a column that says of which joint a row is; None where there is none.
+
+    Args:
+        labels: name -> distinct texts. signals: name -> numbers.
+    """
+    shorts = [name.lower() for _, name in called(joints)]
+    for name, texts in labels.items():
+        of_joints = all(any(t.lower() == s or _alike(t.lower(), s) for s in shorts) for t in texts)
+        if texts and (of_joints or (len(texts) > 1 and COUNTED.search(name))):
+            return name, ", ".join(texts)
+    for name, x in signals.items():
+        values = np.unique(x) if COUNTED.search(name) and x.ndim == 1 else ()
+        if len(values) == len(joints) and any(np.array_equal(values, np.arange(len(joints)) + k) for k in (0, 1)):
+            return name, ", ".join(f"{v:g}" for v in values)
+    return None
 
 
 def _alike(a: str, b: str) -> bool:

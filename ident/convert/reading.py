@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet
 
+from ident.convert.cells import LABELLED, labels_of
 from ident.convert.dates import as_dates, dates_of_texts, seconds
 from ident.convert.layout import read_layout
 from ident.convert.texts import MOST_CELLS, alike, distinct, read_text, scan_text, text_names, text_units
@@ -38,6 +39,7 @@ class Survey:
         dates: names of those that are dates or times of the day.
         doubts: name -> what is doubtful about how it was read, in words; of those left out as well.
         cut: rows that were read of a log that is longer; else 0.
+        labels: name -> distinct texts of a column that has few.
         lists: name -> strings of a list of them, which may name columns; empty where it changes from row to row.
     """
 
@@ -47,6 +49,7 @@ class Survey:
     doubts: dict[str, str]
     cut: int = 0
     lists: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Signals:
@@ -79,11 +82,14 @@ def survey_log(path: Path) -> Survey:
     """
     signals: Signals = {}
     dates, doubts, lists = set(), {}, {}
+    labels: dict[str, tuple[str, ...]] = {}
     rows = [0]
     text = READERS.get(path.suffix.lower()) is read_text
     for name, value in (
-        _read(path, None, lambda p, _: _surveyed(p, doubts, rows)) if text else _read(path, None)
+        _read(path, None, lambda p, _: _surveyed(p, doubts, labels, rows)) if text else _read(path, None)
     ).items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "OU" and value.ndim == 1:
+            labels[name] = labels_of(value[:LABELLED].tolist())
         x = _array(value)
         if (strings := _strings(value)) is not None:
             lists[name] = strings
@@ -94,16 +100,19 @@ def survey_log(path: Path) -> Survey:
             stamps = x.ravel()[~np.isnat(x.ravel())]
             x = seconds(x, stamps[0]) if len(stamps) else np.zeros(0)
         signals[name] = x.astype(float)
-    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0], lists)
+    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0], lists, labels)
 
 
-def _surveyed(path: Path, doubts: dict[str, str], rows: list[int]) -> dict[str, Any]:
-    """Signals of a text, and what is doubtful about them; rows read of one that is longer."""
+def _surveyed(
+    path: Path, doubts: dict[str, str], labels: dict[str, tuple[str, ...]], rows: list[int]
+) -> dict[str, Any]:
+    """Signals of a text, what is doubtful about them, and texts of other columns; rows read of one that is longer."""
     if not read_layout(path).names:
         return read_text(path, None)
     cells = scan_text(path, None)
     if cells and cells[0].rows * len(cells) > MOST_CELLS:
         rows[0] = cells[0].rows
+    labels |= {c.name: c.labels for c in cells if c.labels}
     for c in cells:
         if c.fault is not None:
             doubts[c.name] = f"{c.fault[1][:40]!r} in row {c.fault[0]}"
