@@ -83,6 +83,25 @@ def test_names_that_change_from_row_to_row_are_marked(tmp_path):
     assert "EDIT: joints in the order of the columns, whose names in name change from row to row" in text
 
 
+def test_lists_that_are_damaged_are_no_fault(tmp_path):
+    np.savez(tmp_path / "log.npz", names=np.array([b"\xff", *b"abcde".split()] * 3), t=T, q=Q, tau=TAU)
+    assert guess_map([tmp_path / "log.npz"], ROBOT).warnings == ()
+    log = mat73(tmp_path / "log.mat", list(NAMES))
+    with h5py.File(log, "a") as file:
+        text = file.create_dataset("#refs#/x", data=np.array([2**32 - 1, 5], np.uint32))
+        text.attrs["MATLAB_class"] = np.bytes_("char")
+        file["names"][0, 0] = text.ref
+    assert "columns by their names" not in guess_map([log], ROBOT).text
+    file_of_empty = parquet(tmp_path / "log.parquet", [[None, *NAMES[1:]]] * N)
+    assert "whose names in name change from row to row" in guess_map([file_of_empty], ROBOT).text
+
+
+def test_a_column_of_texts_is_no_list_of_names(tmp_path):
+    state = np.where(T < 1, "a", "b")[:, None]
+    np.savez(tmp_path / "log.npz", state=state, none=np.array([], str), t=T, q=Q, tau=TAU)
+    assert "EDIT" not in guess_map([tmp_path / "log.npz"], ROBOT).text.split("[columns]")[1].replace("EDIT? signs", "")
+
+
 def test_lists_that_contradict_each_other_are_marked(tmp_path):
     np.savez(tmp_path / "log.npz", a=np.array(SHUFFLED), b=np.array(NAMES), t=T, q=Q, tau=TAU)
     text = guess_map([tmp_path / "log.npz"], ROBOT).text

@@ -23,6 +23,7 @@ from robot_assets.errors import DataError
 DEEPEST = 8  # structures inside structures that are looked into
 MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
 MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
+CHANGING = np.array([["a", "b"], ["b", "a"]])  # stands for a list of texts that is not the same in all rows
 LONGEST_NAME = 200  # characters
 NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
 Signals = dict[str, np.ndarray]
@@ -142,17 +143,13 @@ def _array(value: Any) -> np.ndarray | None:
 
 def _strings(x: Any) -> tuple[str, ...] | None:
     """The strings of a short list, or of one a row where all are alike; () where they are not; None of all else."""
-    if (
-        not isinstance(x, np.ndarray)
-        or x.dtype.kind not in "US"
-        or not 0 < x.ndim < 3
-        or x.shape[-1] > MOST_ELEMENTS
-        or (x.ndim == 2 and not len(x))
-    ):
+    if not isinstance(x, np.ndarray) or x.dtype.kind not in "US" or x.ndim not in (1, 2) or not x.size:
+        return None
+    if not 1 < x.shape[-1] <= MOST_ELEMENTS:
         return None
     rows = np.atleast_2d(x)
-    names = rows[0].astype(str) if np.all(rows == rows[0]) else ()
-    return tuple(str(name).strip() for name in names)
+    names = rows[0].tolist() if np.all(rows == rows[0]) else ()
+    return tuple((x.decode(errors="replace") if isinstance(x, bytes) else x).strip() for x in names)
 
 
 def _instead(x: np.ndarray | None) -> str:
@@ -225,7 +222,7 @@ def _names(file: pa.parquet.ParquetFile, name: str) -> np.ndarray | None:
     for batch in file.iter_batches(batch_size=1024, columns=[name]):
         column = batch.column(0)
         if column.null_count or pc.any(pc.not_equal(pc.list_value_length(column), len(column[0]))).as_py():
-            return np.array([], str)
+            return CHANGING
         k = len(column[0])
         if not 0 < k <= MOST_ELEMENTS:
             return None
@@ -234,7 +231,7 @@ def _names(file: pa.parquet.ParquetFile, name: str) -> np.ndarray | None:
         first = names if first is None else first
         rows = codes.indices.to_numpy(zero_copy_only=False).reshape(-1, k)
         if not np.array_equal(names, first) or np.any(rows != rows[0]):
-            return np.array([], str)
+            return CHANGING
     return first
 
 
@@ -384,7 +381,7 @@ def _hdf5_texts(file: Any, item: Any) -> np.ndarray | None:
     parts = [file[ref] if ref else None for ref in np.asarray(item).ravel()]
     if not all(isinstance(p, h5py.Dataset) and p.attrs.get("MATLAB_class", b"") == b"char" for p in parts):
         return None
-    if any(p.external or p.is_virtual or p.size > LONGEST_NAME for p in parts):
+    if any(p.external or p.is_virtual or p.size > LONGEST_NAME or p.dtype != np.uint16 for p in parts):
         return None
     return np.array(["".join(map(chr, np.asarray(p).ravel())) for p in parts])
 
