@@ -7,6 +7,7 @@ All drive figures are referred to the link side of the gear.
 from __future__ import annotations
 
 import os
+import re
 import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from robot_assets.errors import DataError
-from robot_assets.spelling import joint_tables
+from robot_assets.spelling import NAMES, joint_tables
 from robot_assets.urdf import Description, read_urdf
 from robot_assets.values import MISSING, exists, number, read_toml, show, subtable, tables, text, vector
 
@@ -31,6 +32,7 @@ OTHER_NAMES = {
     "q_std": ("q_noise_std",),
     "tau_std": ("tau_noise_std",),
 }
+DRIVE = re.compile(rf"(?m)^[ \t]*\[\[[ \t]*(?:{'|'.join(NAMES)})[ \t]*\]\]")  # begins the table of one
 # Guesses of what a robot.toml may leave out; by whether a joint is linear.
 WINDUP = 1 / 150  # rad: how far a gear winds up under the torque limit
 VELOCITY = {False: np.pi, True: 1.0}  # velocity limit where the URDF has none, rad/s or m/s
@@ -180,6 +182,13 @@ def linear_joints(robot: Robot) -> np.ndarray:
     """(n,) whether a joint is linear: its figures are in kg, N and m for kg m2, N m and rad."""
     kinds = read_urdf(robot.urdf).kinds
     return np.array([kinds[name] == "prismatic" for name in robot.joint_names])
+
+
+def guessed_joints(robot: Robot, key: str) -> tuple[str, ...]:
+    """Joints of which a figure is still marked GUESS in the comment beside it, as ``simgap robot`` writes it."""
+    marked = re.compile(rf"(?m)^[ \t]*({'|'.join((key, *OTHER_NAMES.get(key, ())))})[ \t]*=[^#\n]*#.*\bGUESS\b")
+    drives = DRIVE.split((robot.folder / "robot.toml").read_text(encoding="utf-8-sig"))[1:]
+    return tuple(name for name, drive in zip(robot.joint_names, drives, strict=False) if marked.search(drive))
 
 
 def robot_reference(robot: Robot, folder: Path) -> str:

@@ -97,3 +97,68 @@ def test_names_of_kuka_s_sensor_interface(tmp_path):
     assert columns["q_3"]["source"] == "AIPos.A3" and columns["q_3"]["unit"] == "deg"
     assert columns["tau_3"]["source"] == "MACur.A3" and columns["tau_3"]["unit"] == "A"
     assert tomllib.loads(text)["time"]["source"] == "IPOC"
+
+
+def with_units(log, units):
+    """A row of units below the header."""
+    head, rest = log.read_text().split("\n", 1)
+    log.write_text(f"{head}\n{units}\n{rest}", encoding="utf-8")
+    return log
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "scale", "quoted"),
+    [
+        ("torque{} (%)", None, 0.01, 'per cent of the rated torque ("%")'),
+        ("torque{} [0.1 %]", None, 0.001, 'per mille of the rated torque ("0.1 %")'),
+        ("torque{}", "\u2030", 0.001, 'per mille of the rated torque ("\u2030")'),
+        ("torque{}", "[%]", 0.01, 'per cent of the rated torque ("%")'),
+        ("torque_percent_{}", None, 0.01, "per cent of the rated torque"),
+        ("current{} (%)", None, 0.01, 'per cent of the rated current ("%")'),
+        ("Axis{}_0x6077_TorqueActualValue", None, 0.001, "per mille of the rated torque"),
+        ("Axis{} 6078h CurrentActualValue", None, 0.001, "per mille of the rated current"),
+        ("torque{} [kgf cm]", None, None, 'the unit "kgf cm" of the log is not understood'),
+        ("torque{}", "lb in", None, 'the unit "lb in" of the log is not understood'),
+    ],
+)
+def test_units_of_a_torque_that_are_none_of_a_map_are_quoted_and_marked(tmp_path, name, unit, scale, quoted):
+    q, tau = back_and_forth()
+    log = log_of(tmp_path, q, tau, ("q{}", name))
+    text, columns = columns_of(with_units(log, ",".join(["s", *["rad"] * 6, *[unit] * 6])) if unit else log)
+    note = next(line for line in text.splitlines() if line.startswith("# tau:"))
+    assert f"EDIT: {quoted}" in note and columns["tau_2"].get("scale") == scale
+    # Their size tells no side of the gear.
+    assert "side" not in columns["tau_2"] and "limit" not in note
+
+
+@pytest.mark.parametrize(
+    "name", ["torque (A{})", "torque{} (measured)", "torque [{}]", "motor torque{} (act)", "torque{} (motor)", "tau_{}"]
+)
+def test_what_stands_in_brackets_and_is_no_unit_is_not_marked(tmp_path, name):
+    text, _ = columns_of(log_of(tmp_path, *back_and_forth(), ("q{}", name)))
+    assert "not understood" not in text and "whole numbers" not in text and "rated" not in text
+
+
+def test_other_channels_quote_units_too(tmp_path):
+    q, tau = back_and_forth()
+    text, columns = columns_of(log_of(tmp_path, q, tau, ("pos{} [gon]", "tau{}")))
+    assert '# q: EDIT: the unit "gon" of the log is not understood' in text and "tau_1" in columns
+
+
+def test_whole_numbers_without_a_unit_are_marked(tmp_path):
+    q, tau = back_and_forth()
+    counts = np.round(q * 2**20 / (2 * np.pi))
+    text, _ = columns_of(log_of(tmp_path, counts, np.round(tau * 10)))
+    assert "# tau: EDIT: whole numbers without a unit" in text and "# q: EDIT: whole numbers without a unit" in text
+    text, columns = columns_of(
+        log_of(tmp_path, np.round(np.rad2deg(q)), np.round(tau * 1e3), ("q{} [deg]", "tau{} [mNm]"))
+    )
+    assert "whole numbers" not in text and columns["tau_1"]["unit"] == "mN m"
+
+
+def test_what_a_log_writes_stands_in_one_line_of_a_comment(tmp_path):
+    q, tau = back_and_forth()
+    names = np.array([f"a{j}\n[columns]\nq_1 = 1" for j in range(6)])
+    np.savez(tmp_path / "log.npz", names=names, q=q, tau=tau)
+    text, columns = columns_of(tmp_path / "log.npz")
+    assert "calls a0 [columns] q_1 = 1, a1" in text and columns["q_1"]["source"] == "q"

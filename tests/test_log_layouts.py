@@ -11,7 +11,7 @@ import scipy.io
 
 from ident.convert import convert_logs
 from ident.convert.guess import guess_map
-from ident.convert.reading import list_signals
+from ident.convert.reading import list_signals, survey_log
 from ident.convert.spelling import split_unit, unit_of
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -301,3 +301,118 @@ def test_a_log_in_which_nothing_is_recognised_is_an_error_and_leaves_no_map(tmp_
     (line,) = result.stderr.strip().splitlines()
     assert result.returncode == 2 and "nothing that looks like" in line and "thing 2" in line
     assert not (tmp_path / "map.toml").exists() and not result.stdout
+
+
+@pytest.mark.parametrize("state", ["OK", "run / hold", "", "m"])
+@pytest.mark.parametrize("below", ["ms;°;mNm;", "[ms];[°];[mNm];-", "ms;°;mNm;text", ";°;mNm;"])
+def test_units_are_read_below_a_header_where_a_column_holds_texts(tmp_path, state, below):
+    log = written(
+        tmp_path / "log.csv", {"t": T, "a": Q[:, 0], "b": TAU[:, 0], "Status": [state] * N}, ";", "", f"{below}\n"
+    )
+    survey = survey_log(log)
+    assert np.allclose(survey.signals["a"], Q[:, 0]) and len(survey.signals["a"]) == N
+    assert survey.units["a"] == below.split(";")[1] and survey.units["b"] == below.split(";")[2]
+
+
+def test_a_first_row_of_a_text_alone_is_no_row_of_units(tmp_path):
+    log = written(tmp_path / "log.csv", {"t": T, "a": Q[:, 0], "mode": ["A"] * N}, below=",,A\n")
+    survey = survey_log(log)
+    assert not survey.units and len(survey.signals["a"]) == N + 1
+
+
+def scope(path, times, end=""):
+    """As TwinCAT's Scope writes tables: a time before each channel, and a key before each word above them."""
+    channels = {
+        f"GVL.Axis{j + 1}.{k}": x[:, j]
+        for k, x in {"ActPos": np.rad2deg(Q), "ActTorque": TAU}.items()
+        for j in range(6)
+    }
+    units = ["deg"] * 6 + ["Nm"] * 6
+    above = ["Name\tScope Project", "File\tC:\\run.svdx", "Starttime of export\t133765432100000000", ""]
+    above.append("\t".join(f"Name\t{name}" for name in channels) + end)
+    above.append("SymbolComment" + "\t" * 23)
+    above.append("\t".join(f"Unit\t{unit}" for unit in units))
+    above += ["\t".join(["SampleTime[ms]\t2"] * 12), ""]
+    cells = np.stack([x for pair in zip(times, channels.values(), strict=True) for x in pair], axis=1)
+    rows = ["\t".join(f"{x:.15g}" for x in row) + end for row in cells]
+    path.write_text("\n".join([*above, *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("end", ["", "\t"])
+def test_a_table_with_a_time_before_each_channel_is_read(tmp_path, end):
+    guessed, data = converted(scope(tmp_path / "scope.csv", [1e3 * T] * 12, end))
+    assert guessed.found["time"] == "Time, 500 Hz" and tomllib.loads(guessed.text)["time"]["unit"] == "ms"
+    assert tomllib.loads(guessed.text)["columns"]["tau_2"] == {"source": "GVL.Axis2.ActTorque", "unit": "N m"}
+    assert np.allclose(whole(data, "q"), Q) and np.allclose(whole(data, "tau"), TAU)
+
+
+def test_times_of_channels_that_differ_are_refused(tmp_path):
+    log = scope(tmp_path / "scope.csv", [1e3 * T] * 11 + [1e3 * T + 1])
+    assert "EDIT? several columns that differ" in guess_map([log], "ur10_bare").text
+    with pytest.raises(DataError, match=r"Time twice, and the columns differ.*one time for all"):
+        converted(log)
+
+
+def test_a_column_that_is_repeated_is_read_once_and_others_of_one_name_are_refused(tmp_path):
+    log, given = tmp_path / "log.csv", tmp_path / "map.toml"
+    given.write_text(f'sample_rate = {RATE}\n[time]\nsource = "t"\n{BENCH}')
+    for second, good in ((T, True), (T + 1e-3, False)):
+        rows = "\n".join(
+            f"{a:.9g},{b:.9g},{c:.9g},{d:.9g}" for a, b, c, d in zip(T, TAU[:, 0], second, Q[:, 0], strict=True)
+        )
+        log.write_text(f"t,u,t,x\n{rows}\n")
+        if good:
+            assert np.allclose(whole(convert_logs([log], "twomass", given), "q")[:, 0], Q[:, 0])
+        else:
+            with pytest.raises(DataError, match="t twice, and the columns differ"):
+                convert_logs([log], "twomass", given)
+
+
+ROWS_OF = {"names": load_robot("ur10_bare").joint_names, "counted": range(1, 7), "counted from 0": range(6)}
+
+
+def long(folder, kind, names, by_joint=False):
+    """A table with a row for each joint and time."""
+    at = np.arange(6 * N)
+    j, k = (at // N, at % N) if by_joint else (at % 6, at // 6)
+    cells = [str(names[i]) for i in j]
+    if kind == "csv":
+        return written(folder / "log.csv", {"t": T[k], "joint": cells, "position": Q[k, j], "torque": TAU[k, j]})
+    joint = pa.array(cells).dictionary_encode() if kind == "parquet categories" else pa.array(cells)
+    joint = joint if isinstance(names, tuple) else joint.cast(pa.int64())
+    pq.write_table(
+        pa.table({"t": T[k], "joint": joint, "position": Q[k, j], "torque": TAU[k, j]}), folder / "log.parquet"
+    )
+    return folder / "log.parquet"
+
+
+@pytest.mark.parametrize("by_joint", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "rows"),
+    [("csv", "names"), ("csv", "counted"), ("csv", "counted from 0"), ("parquet", "names"), ("parquet categories", "names"), ("parquet", "counted")],
+)  # fmt: skip
+def test_rows_of_one_joint_each_are_refused_with_the_column_that_names_it(tmp_path, kind, rows, by_joint):
+    log = long(tmp_path, kind, ROWS_OF[rows], by_joint)
+    with pytest.raises(DataError, match=r"rows of one joint each: joint holds .*pivot the table by joint"):
+        guess_map([log], "ur10_bare")
+    columns = "".join(f'q_{j + 1} = "position"\ntau_{j + 1} = "torque"\n' for j in range(6))
+    (tmp_path / "map.toml").write_text(f'sample_rate = {RATE}\n[time]\nsource = "t"\n[columns]\n{columns}')
+    with pytest.raises(DataError, match="a stamp that goes back" if by_joint else "pivot a table of one joint a row"):
+        convert_logs([log], "ur10_bare", tmp_path / "map.toml")
+
+
+def test_a_coarse_clock_is_no_table_of_rows_of_one_joint(tmp_path):
+    log, given = (
+        written(tmp_path / "log.csv", {"t": np.floor(T * 250) / 250, "u": TAU[:, 0], "x": Q[:, 0]}),
+        tmp_path / "m.toml",
+    )
+    given.write_text(f'sample_rate = 250.0\n[time]\nsource = "t"\n{BENCH}')
+    (s,) = convert_logs([log], "twomass", given).segments
+    assert np.allclose(s.q[:, 0], Q[::2, 0], atol=1e-9)
+
+
+def test_a_log_without_signals_of_joints_is_told_as_before(tmp_path):
+    log = written(tmp_path / "log.csv", {"t": T, "state": ["run"] * N, "position": Q[:, 0]})
+    with pytest.raises(DataError, match="nothing that looks like a position or a torque of 6 joints"):
+        guess_map([log], "ur10_bare")

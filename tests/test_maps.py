@@ -159,6 +159,31 @@ def test_a_reference_of_the_motor_is_an_angle_or_a_torque_by_its_unit(tmp_path, 
     assert any("r_2 taken as zero" in line for line in told)
 
 
+def test_a_guessed_gear_ratio_that_scales_a_column_is_told(tmp_path):
+    log, text = two_joints(tmp_path)
+    robot = tmp_path / "arm" / "robot.toml"
+    given = robot.read_text(encoding="utf-8")
+
+    def told(old="", new="", more=""):
+        lines = []
+        given_map = mapped(tmp_path, text.replace(old, new, 1) + more)
+        convert_logs([log], tmp_path / "arm", given_map, say=lines.append)
+        return [line for line in lines if "GUESS" in line]
+
+    motor = ('q_1 = "a"', 'q_1 = { source = "a", side = "motor" }')
+    (line,) = told(*motor)
+    assert line.startswith("q of turn scaled by a gear_ratio that is marked GUESS in robot.toml")
+    (line,) = told(*motor, 'r_2 = { source = "d", unit = "N m", side = "motor" }')
+    assert line.startswith("q, r of turn, slide scaled")
+    # No ratio of the robot in it: on the link side, or of the map's own.
+    assert not told() and not told(motor[0], 'q_1 = { source = "a", side = "motor", gear = 100.0 }')
+    assert not told(more="".join(f'temp_{j} = {{ source = "a", side = "motor" }}\n' for j in (1, 2)))
+    robot.write_text(re.sub(r"(gear_ratio = \S+).*", r"\1   # of the data sheet", given, count=1), encoding="utf-8")
+    assert not told(*motor) and told('"d"', '{ source = "d", side = "motor", unit = "N m" }')
+    robot.write_text(given.replace("gear_ratio", "ratio").replace("[[joint]]", "[[drive]]"), encoding="utf-8")
+    assert told(*motor)
+
+
 @pytest.mark.parametrize("channel", ["qd", "q_ref", "temp"])
 def test_a_channel_of_some_joints_is_not_filled_up(tmp_path, channel):
     log, text = two_joints(tmp_path)

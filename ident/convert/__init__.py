@@ -9,7 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
+from ident.convert.clock import (
+    Stamps,
+    at_times,
+    changed,
+    check_rows,
+    check_stamps,
+    resample,
+    stamp_seconds,
+    uniform_times,
+)
 from ident.convert.joining import on_one_clock
 from ident.convert.mapping import Column, LogMap, read_map
 from ident.convert.reading import read_log
@@ -17,7 +26,7 @@ from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
 from ident.segment_file import LARGEST, SHORTEST
 from robot_assets.errors import DataError
-from robot_assets.robot import linear_joints, load_robot
+from robot_assets.robot import Robot, guessed_joints, linear_joints, load_robot
 
 
 def convert_logs(
@@ -43,6 +52,7 @@ def convert_logs(
     segments: list[Segment] = []
     logs = _logs([Path(f) for f in files], log_map, str(map_path))
     _check_roles(logs, log_map, str(map_path))
+    _tell_guessed_ratios(log_map, arm, say)
     for log_name, paths in logs:
         progress(f"reading {', '.join(p.name for p in paths.values())}")
         found = _segments(log_name, paths, log_map, arm.n, say)
@@ -112,6 +122,18 @@ def _check_roles(logs: list[tuple[str, dict[str, Path]]], m: LogMap, where: str)
             raise DataError("[roles]", where, f"two roles of one log: {own}", "one")
 
 
+def _tell_guessed_ratios(m: LogMap, arm: Robot, say: Callable[[str], None]) -> None:
+    """Say where figures of a drive that are guesses scale what is converted."""
+    guessed = guessed_joints(arm, "gear_ratio")
+    scaled = [c for c in m.columns if c.geared and arm.joint_names[c.joint] in guessed]
+    if scaled:
+        channels = ", ".join(dict.fromkeys(c.channel for c in scaled))
+        joints = ", ".join(name for j, name in enumerate(arm.joint_names) if j in {c.joint for c in scaled})
+        say(
+            f"{channels} of {joints} scaled by a gear_ratio that is marked GUESS in robot.toml: take the mark away where it is known"
+        )
+
+
 def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
     if not m.files:
         return read_log(paths[""], m.sources, {m.time} if m.time else frozenset())
@@ -163,6 +185,7 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
                 raise DataError(source, str(path), f"{len(other)} values", f"one for each of {N} samples")
             seconds = seconds + stamp_seconds(other, factor, other[0])
         clock = check_stamps(seconds, m.sample_rate, path)
+        check_rows(clock, channels["q"], path)
         clocks, t = [clock], uniform_times(0.0, float(clock.t[-1]), m.sample_rate)
         if not at_times(clock, t, m.sample_rate):
             rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)

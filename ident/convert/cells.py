@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +16,7 @@ from robot_assets.errors import DataError
 NUMBER = r"(?i)^\s*([+-]?(\d+\.?\d*|\.\d+)([ed][+-]?\d+)?|[+-]?inf(inity)?|[+-]?nan|)\s*$"
 THOUSANDS = r"^\s*[+-]?[1-9]\d?\d?(,\d\d\d)+\s*$"
 FORTRAN = r"^([+-]?[0-9.]+)[dD]([+-]?[0-9]+)$"  # an exponent of its double precision
+LABELLED, MOST_LABELS = 10_000, 100  # cells that tell what a column of texts holds, as many kinds as joints
 SEVERAL_COMMAS = r",.*,"
 
 
@@ -24,6 +27,7 @@ class Cells:
         kind: "numbers", "dates" or "texts"; empty as long as all cells were. rows: taken.
         order: of year, month and day in its dates, and whether it is a guess.
         fault: (row from 1, text) of the first that is none like those above it.
+        labels: distinct texts of its first cells, where they are no numbers and few.
     """
 
     def __init__(self, name: str, path: Path, wanted: bool, quoted: bool) -> None:
@@ -32,6 +36,7 @@ class Cells:
         self.kind, self.rows, self.like, self.order = "", 0, "", ("ymd", False)
         self.comma = self.dot = False
         self.fault: tuple[int, str] | None = None
+        self.labels: tuple[str, ...] = ()
         self._parts: list[np.ndarray] = []
 
     def take(self, column: pa.Array) -> None:
@@ -120,6 +125,7 @@ class Cells:
         kind, self.kind = self.kind, "texts"
         self._parts = []
         if not self.wanted:
+            self.labels = () if self.rows else labels_of(_text(x) for x in column.slice(0, LABELLED))
             return
         if kind == "dates":
             raise DataError(
@@ -148,6 +154,13 @@ class Cells:
             except pa.ArrowInvalid:
                 high = middle
         return low
+
+
+def labels_of(texts: Iterable[Any]) -> tuple[str, ...]:
+    """Distinct texts, where they are few and nothing else stands among them; else none."""
+    found = dict.fromkeys(texts)
+    few = 0 < len(found) <= MOST_LABELS and all(isinstance(x, str) for x in found)
+    return tuple(str(x).strip() for x in found) if few else ()
 
 
 def _cast(column: pa.Array) -> np.ndarray:

@@ -21,6 +21,8 @@ GAP = 1.5  # samples, of the log or of the dataset: a longer step is a gap
 FASTER = 1.2  # times the rate of the dataset, above which a log holds frequencies that would fold
 PASSED = 0.8  # of the new Nyquist frequency, up to which nothing changes; above all of it nothing is left
 REJECTED = 80.0  # dB
+OF_JOINTS = 0.4  # of the rows, at the time of the one before: rows of two joints each are half
+FAR = 10.0  # times as far as from stamp to stamp
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,20 @@ def check_stamps(t: np.ndarray, rate: float, path: Path) -> Stamps:
     usual = float(np.median(step[step > 0])) if np.any(step > 0) else 1 / rate
     long = step > GAP * max(usual, 1 / rate)
     return Stamps(t, 1 / usual, t[:-1][long], t[1:][long])
+
+
+def check_rows(stamps: Stamps, q: np.ndarray, path: Path) -> None:
+    """Raise a DataError where rows of one stamp hold positions q (N, n) of several joints: they differ by far more than
+    a joint moves from stamp to stamp, and not as where a clock is coarse."""
+    same = np.diff(stamps.t) == 0
+    if not np.sum(same) > OF_JOINTS * len(same):
+        return
+    first = q[np.concatenate([[True], ~same])]
+    within = np.median(np.abs(np.diff(q, axis=0)[same]), axis=0)
+    if np.any(within > FAR * np.median(np.abs(np.diff(first, axis=0)), axis=0)):
+        found = f"{int(np.sum(same))} of {len(q)} rows at the time of the one before, with positions far from it"
+        expected = "a row for each time with columns for all joints: pivot a table of one joint a row"
+        raise DataError("time", str(path), found, expected)
 
 
 def uniform_times(start: float, end: float, rate: float) -> np.ndarray:

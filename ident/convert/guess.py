@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ident.convert.guess_names import choose, families_of, oriented, score, words_of
+from ident.convert.guess_order import Names, joint_column
 from ident.convert.guess_text import plain, render
 from ident.convert.guess_time import FileClock, FoundTime, find_time
 from ident.convert.guess_units import guess_scales, unwrapped
@@ -73,6 +74,12 @@ def guess_map(
         for k, text in s.units.items()
         if (u := unit_of(text.strip("[](){}<> ")))
     }
+    unread = {
+        f"{p}{k}": bare
+        for p, s in zip(starts, surveys)
+        for k, text in s.units.items()
+        if f"{p}{k}" not in units and (bare := text.strip("[](){}<> "))
+    }
     dates = {f"{p}{k}" for p, s in zip(starts, surveys) for k in s.dates}
     damaged = {
         f"{p}{k}": int(bad[0]) + 1
@@ -90,7 +97,10 @@ def guess_map(
         raise DataError("log", str(paths[0]), f"no signal of {SHORTEST} samples or more{why}", "columns of numbers")
     # The log has the length at which most values stand.
     N = max(set(lengths), key=lambda k: sum(x.size for x in signals.values() if _length(x) == k))
-    families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm)
+    lists = {f"{p}{k}": names for p, s in zip(starts, surveys) for k, names in s.lists.items()}
+    if not parts:
+        warnings += _other_orders(paths, [s.lists for s in surveys])
+    families = families_of({k: x for k, x in signals.items() if _length(x) == N}, units, arm, lists, unread)
     time = (
         FoundTime(rate=min(c.rate for c in clocks.values()))
         if clocks
@@ -98,6 +108,14 @@ def guess_map(
     )
     chosen, others = choose([f for f in families if f.x.shape[1] == arm.n and f.name not in time.sources | dates], arm)
     if not {"tau", "q"} & set(chosen):
+        long = joint_column(surveys[0].labels, surveys[0].signals, arm.joint_names) if arm.n > 1 else None
+        if long is not None:
+            raise DataError(
+                "rows",
+                str(paths[0]),
+                f"rows of one joint each: {plain(long[0])} holds {plain(long[1])}",
+                f"a row for each time with columns for all joints: pivot the table by {plain(long[0])}",
+            )
         names = ", ".join(plain(f.name) for f in families if f.name not in time.sources)
         raise DataError(
             "signals",
@@ -128,6 +146,16 @@ def guess_map(
 
 def _length(x: np.ndarray) -> int:
     return max(x.shape) if x.ndim else 0
+
+
+def _other_orders(paths: list[Path], lists: list[Names]) -> list[str]:
+    """Of logs each, those that name their columns otherwise than the first, from which the map is guessed."""
+    return [
+        f"{path.name}: {plain(name)} lists other names than in {paths[0].name}: it needs a map of its own"
+        for path, own in zip(paths[1:], lists[1:], strict=True)
+        for name in own
+        if own[name] != lists[0].get(name, own[name])
+    ]
 
 
 # --- files of one log, or a log each

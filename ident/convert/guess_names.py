@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
+from ident.convert.guess_order import Names, called, columns_by_names
 from ident.convert.guess_units import Family
-from ident.convert.spelling import split_unit
+from ident.convert.spelling import split_unit, unread_unit
 from robot_assets.robot import Robot
 
 CHANNELS = ("tau", "q", "qd", "q_ref", "q_link", "temp")
@@ -90,14 +93,29 @@ def _split(word: str) -> tuple[str, ...]:
     return (word,)
 
 
-def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robot) -> list[Family]:
+def families_of(
+    signals: dict[str, np.ndarray],
+    units: dict[str, str],
+    arm: Robot,
+    lists: Names = MappingProxyType({}),
+    unread: Mapping[str, str] = MappingProxyType({}),
+) -> list[Family]:
     """Arrays of a column a joint, single columns numbered or named by joint, and what is left alone.
 
     Args:
         units: name -> unit, of those for which the log says it apart from the name.
+        lists: lists of strings in the log, which may name the columns of its arrays.
+        unread: name -> unit as the log writes it, of those that are none of a map.
     """
     n, out, single = arm.n, [], {}
     stems, own = {}, dict(units)
+
+    def strange(*names: str) -> str:
+        rows = " or ".join(dict.fromkeys(unread[k] for k in names if k in unread))
+        # Where it sets the columns of a quantity apart it is no unit.
+        told = {"" if k in own else _strange(k, arm) for k in names}
+        return rows or (told.pop() if len(told) == 1 else "")
+
     for name, x in signals.items():
         stems[name], unit = split_unit(name)
         if unit is not None:
@@ -106,19 +124,26 @@ def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robo
         if x.shape[1] == 1:
             single[name] = x[:, 0]
         elif x.shape[1] >= n:
-            out.append(Family(name, words_of(stems[name]), tuple((name, j) for j in range(n)), x[:, :n], own.get(name)))
+            columns, note = columns_by_names(name, x.shape[1], lists, arm.joint_names)
+            sources = tuple((name, k) for k in columns)
+            out.append(
+                Family(
+                    name, words_of(stems[name]), sources, x[:, list(columns)], own.get(name), note, unread=strange(name)
+                )
+            )
 
     def alone(name: str) -> Family:
-        return Family(name, words_of(stems[name]), ((name, None),), single[name][:, None], own.get(name))
+        words, source = words_of(stems[name]), ((name, None),)
+        return Family(name, words, source, single[name][:, None], own.get(name), unread=strange(name))
 
     if n == 1:
         return out + [alone(k) for k in single]
     sets: dict[tuple[str, str | None], dict[int, str]] = {}
     for name in single:
         stem, unit = stems[name], own.get(name)
-        for joint, called in _called(arm.joint_names):
-            if called in stem:
-                sets.setdefault((stem.replace(called, "{}", 1), unit), {})[arm.joint_names.index(joint)] = name
+        for joint, name_of in called(arm.joint_names):
+            if name_of in stem:
+                sets.setdefault((stem.replace(name_of, "{}", 1), unit), {})[arm.joint_names.index(joint)] = name
                 break
         for m in re.finditer(r"\d+", stem):
             sets.setdefault((stem[: m.start()] + "{#}" + stem[m.end() :], unit), {})[int(m[0])] = name
@@ -127,7 +152,17 @@ def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robo
     def joined(name: str, words: tuple[str, ...], members: list[str], note: str = "") -> None:
         used.update(members)
         columns = np.stack([single[k] for k in members], axis=1)
-        out.append(Family(name, words, tuple((k, None) for k in members), columns, own.get(members[0]), note))
+        out.append(
+            Family(
+                name,
+                words,
+                tuple((k, None) for k in members),
+                columns,
+                own.get(members[0]),
+                note,
+                unread=strange(*members),
+            )
+        )
 
     for (stem, _), members in sets.items():
         first = 0 if 0 in members or "{#}" not in stem else 1
@@ -144,16 +179,12 @@ def families_of(signals: dict[str, np.ndarray], units: dict[str, str], arm: Robo
     return out + [alone(k) for k in single if k not in used]
 
 
-def _called(joints: tuple[str, ...]) -> list[tuple[str, str]]:
-    """(joint, how a log may call it): its name, and what sets it apart from the others; longer ones first, as
-    "joint_1" is also part of "joint_10"."""
-    out = {name: name for name in joints}
-    parts = {name: name.split("_") for name in joints}
-    for name in joints if len(joints) > 1 else ():
-        short = "_".join(p for p in parts[name] if not all(p in other for other in parts.values()))
-        if len(short) > 2 and words_of(short):
-            out.setdefault(short, name)
-    return sorted(((joint, called) for called, joint in out.items()), key=lambda pair: -len(pair[1]))
+def _strange(name: str, arm: Robot) -> str:
+    """What stands in the place of a unit in a name, is none of a map and says nothing else; empty where there is none."""
+    text = unread_unit(name) or ""
+    vocabulary = {w for table in WORDS.values() for w in table} | {*REFERENCE, *LINK, *MOTOR, *ACTUAL, *DERIVED}
+    told = {text.lower(), *words_of(text)} & (vocabulary | {short.lower() for _, short in called(arm.joint_names)})
+    return "" if told else text
 
 
 def _alike(names: list[str], stems: dict[str, str], units: dict[str, str], n: int) -> list[list[str]]:

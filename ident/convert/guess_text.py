@@ -27,6 +27,8 @@ LINEAR_UNITS = {
     "kN m": "kN",
 }
 
+LONGEST_NOTE = 1000  # characters
+
 
 def render(
     paths: list[Path],
@@ -104,7 +106,7 @@ def render(
             for name, _ in dict(family.sources).items()
             if name in doubts
         )
-        notes = "; ".join(note for note in (family.note, scale.note, *damaged) if note)
+        notes = plain("; ".join(note for note in (family.note, scale.note, *damaged) if note), LONGEST_NOTE)
         lines += ["", f"# {channel}: {notes}" if notes else f"# {channel}"]
         if others[channel]:
             lines.append("# might also be: " + ", ".join(plain(f.name) for f in others[channel]))
@@ -121,7 +123,8 @@ def render(
                 *([] if index is None or index == j else [f"index = {index}"]),
                 *options,
             ]
-            if channel != "temp" and np.ptp(family.x[:, j]) == 0 and channel not in ("tau", "q"):
+            # Only encoders at the link may be at some joints alone.
+            if channel == "q_link" and np.ptp(family.x[:, j]) == 0:
                 lines.append(f"# {channel}_{j + 1} is constant in the log")
                 continue
             lines.append(f"{'# ' if broken else ''}{channel}_{j + 1} = {{ {', '.join(options)} }}")
@@ -175,9 +178,9 @@ def period_of(chosen: dict[str, Family]) -> int | None:
     return int(lags[start + int(np.argmax(c[start:end]))])
 
 
-def plain(text: str) -> str:
+def plain(text: str, most: int = 120) -> str:
     """Text of a log as it may stand in a comment: one line without control characters."""
-    return "".join(ch if ch.isprintable() else " " for ch in text)[:120]
+    return "".join(ch if ch.isprintable() else " " for ch in text)[:most]
 
 
 def quoted(text: str) -> str:

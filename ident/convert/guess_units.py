@@ -6,12 +6,14 @@ must be the derivative of the position, and friction must take energy out.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.convert.quantities import UNITS
+from ident.convert.spelling import share_of
 from robot_assets.robot import Robot
 
 NAMED_UNITS = {
@@ -27,6 +29,10 @@ NEAR = 0.25  # of a turn, between two samples: a joint that is faster hides wher
 REVERSALS, SAMPLES = 3, 500  # of a motion, below which neither friction nor sizes tell a sign or a side
 HYSTERESIS = 0.05  # of the range of a motion, by which it must go back to be turning round
 LOOKED_AT = 4000  # samples in which turns are counted
+ANGLES, LENGTHS = ("deg", "rad", "mrad", "rev"), ("m", "mm", "um")
+TORQUE_UNITS = ("N m", "mN m", "kN m", "N", "kN", "A", "mA", "V")
+# Objects of CiA 402 in per mille of the rated torque or current: target, demand, actual.
+RATED_OBJECTS = re.compile(r"(?i)(?<![0-9a-f])(0x60(71|74|77|78)(?![0-9a-f])|60(71|74|77|78)h)")
 ELECTRIC = ("A", "mA", "V")
 CURRENTS = ("current", "currents", "curr", "cur", "strom", "iq")
 
@@ -41,6 +47,7 @@ class Family:
         x: (N, n) values as they stand in the log.
         unit: that the log says, of a map; None where it says none.
         note: what is doubtful about it.
+        unread: unit as the log writes it, which is none of a map; empty where there is none.
         wraps: whether the log has its angles within one turn; ``x`` then goes on over it.
     """
 
@@ -51,6 +58,7 @@ class Family:
     unit: str | None = None
     note: str = ""
     wraps: bool = False
+    unread: str = ""
 
     def has(self, vocabulary: Sequence[str]) -> bool:
         """Whether a word of its name is one of the vocabulary, or begins with one of more than two letters."""
@@ -80,6 +88,7 @@ def guess_scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate
     # A drive that reports torque before the gear mostly reports its position there too.
     before = (
         "tau" in chosen
+        and not _raw(chosen["tau"], TORQUE_UNITS)
         and _before_gear(chosen["tau"], _torque_unit(chosen["tau"], linear), arm)
         and bool(np.mean(_turned(chosen.get("q"))) >= 0.5)
     )
@@ -93,7 +102,7 @@ def guess_scales(chosen: dict[str, Family], arm: Robot, linear: np.ndarray, rate
     if "tau" in chosen:
         out["tau"] = _torque(chosen["tau"], chosen.get("q"), out.get("q"), arm, linear, rate or 1000.0)
     if "temp" in chosen:
-        out["temp"] = Scale(np.ones(arm.n), ('unit = "degC"',), "")
+        out["temp"] = Scale(np.ones(arm.n), ('unit = "degC"',), _unread(chosen["temp"]))
     return out
 
 
@@ -153,11 +162,22 @@ def unwrapped(family: Family) -> Family:
 
 def _position(family: Family, arm: Robot, linear: np.ndarray, rate: float | None, before: bool) -> Scale:
     """The first unit and side with which the motion fits the limits of place and speed."""
+    found = _fitting(family, arm, linear, rate, before)
+    doubt = _unread(family)
+    if not doubt and _raw(family, LENGTHS if np.all(linear) else ANGLES):
+        meter, turn = ("m", "travel") if np.all(linear) else ("rad", "2 pi")
+        doubt = (
+            f'EDIT: whole numbers without a unit: counts? Then unit = "{meter}" and scale = {turn} / counts of a turn'
+        )
+    return replace(found, note="; ".join(note for note in (doubt, found.note) if note))
+
+
+def _fitting(family: Family, arm: Robot, linear: np.ndarray, rate: float | None, before: bool) -> Scale:
     meter = "m" if np.all(linear) else "rad"
     if np.all(linear):
-        named, choices = _unit_of(family, ("m", "mm", "um")), [("m", "link"), ("mm", "link"), ("um", "link")]
+        named, choices = _unit_of(family, LENGTHS), [("m", "link"), ("mm", "link"), ("um", "link")]
     else:
-        named = _unit_of(family, ("deg", "rad", "mrad", "rev"))
+        named = _unit_of(family, ANGLES)
         choices = [("rad", "link"), ("deg", "link"), ("rad", "motor"), ("deg", "motor"), ("rev", "motor")]
         if before:
             choices[1], choices[2] = choices[2], choices[1]
@@ -208,13 +228,43 @@ def _velocity(family: Family, velocity: np.ndarray | None, arm: Robot, linear: n
                     factor = sign * UNITS[unit] / (arm.array("gear_ratio") if side == "motor" else np.ones(arm.n))
                     if np.any(moving) and np.all(np.abs(slope / factor - 1)[moving] < 0.15):
                         return Scale(factor, _options(unit, side, sign), "the derivative of q says so")
-    return Scale(
-        np.ones(arm.n), _options(choices[0], "link"), "EDIT: this is not the derivative of q in any usual unit"
+    doubt = "; ".join(
+        note for note in (_unread(family), "EDIT: this is not the derivative of q in any usual unit") if note
     )
+    return Scale(np.ones(arm.n), _options(choices[0], "link"), doubt)
+
+
+def _unread(family: Family) -> str:
+    """A note that quotes a unit which is none of a map; empty where there is none."""
+    return f'EDIT: the unit "{family.unread[:40]}" of the log is not understood' if family.unread else ""
+
+
+def _raw(family: Family, allowed: Sequence[str]) -> bool:
+    """Whether a family may be raw numbers of a drive: whole ones without a unit, a share, or of a unit that is none of
+    a map."""
+    if _unit_of(family, allowed) is not None:
+        return False
+    return bool(family.unread or _share(family) is not None or np.all(family.x == np.round(family.x)))
+
+
+def _share(family: Family) -> float | None:
+    """Of the rated value, in which a family is given: by its unit, its name, or the object of a drive; else None."""
+    return share_of(family.name, family.unread) or (1e-3 if RATED_OBJECTS.search(family.name) else None)
+
+
+def _raw_torque(family: Family, unit: str) -> tuple[tuple[str, ...], str]:
+    """Options and note of a torque, or a current, that is raw numbers of a drive."""
+    share, what = _share(family), "current" if unit in ELECTRIC else "torque"
+    if share is not None:
+        each = "per cent" if share > 5e-3 else "per mille"
+        quoted = f' ("{family.unread[:40]}")' if family.unread else ""
+        note = f'EDIT: {each} of the rated {what}{quoted}, which the log does not tell: scale = {share:g} times it in {unit}; side = "motor" if it is that of the motor'
+        return (f"scale = {share:g}",), note
+    return (), _unread(family) or f"EDIT: whole numbers without a unit: raw ones of a drive? Scale gives {unit} of one"
 
 
 def _torque_unit(family: Family, linear: np.ndarray) -> str:
-    unit = _unit_of(family, ("N m", "mN m", "kN m", "N", "kN", "A", "mA", "V"))
+    unit = _unit_of(family, TORQUE_UNITS)
     return unit or ("A" if family.has(CURRENTS) else "N" if np.all(linear) else "N m")
 
 
@@ -225,13 +275,17 @@ def _torque(
     factor = np.full(arm.n, UNITS[unit])
     share = float(np.median(np.abs(family.x * factor).max(axis=0) / arm.array("torque_limit")))
     options, notes = [], [range_text(family.x)]
+    raw = _raw(family, TORQUE_UNITS)
+    if raw:
+        more, note = _raw_torque(family, unit)
+        options, notes = [*more], [note, *notes]
     if unit in ELECTRIC:
         options.append("torque_constant = 1.0")
         notes.append(
             f"EDIT: the torque constant, the side that it is for, or the unit if this is a {'force' if np.all(linear) else 'torque'} after all"
         )
     turned = np.broadcast_to(_turned(position), arm.n)
-    before = _before_gear(family, unit, arm)
+    before = not raw and _before_gear(family, unit, arm)
     if before and np.mean(turned) < 0.5:
         notes.append(
             f'EDIT: {share:.2g} of the torque limit: before the gear (side = "motor")? The motion turns round too seldom to tell'
@@ -239,9 +293,9 @@ def _torque(
     elif before:
         side, factor = "motor", factor * arm.array("gear_ratio")
         notes.append(f"EDIT? {share:.2g} of the torque limit: before the gear by its size")
-    elif share > 3.0 and unit not in ELECTRIC:
+    elif share > 3.0 and unit not in ELECTRIC and not raw:
         notes.append(f"EDIT: {share:.3g} times the torque limit")
-    elif share < 0.03 and unit not in ELECTRIC:
+    elif share < 0.03 and unit not in ELECTRIC and not raw:
         notes.append(f"EDIT? only {share:.2g} of the torque limit: is the unit right?")
     signs = np.ones(arm.n)
     if position is not None and scale is not None:

@@ -19,6 +19,8 @@ LOOKED_AT = 100  # lines that say how the table is laid out
 MOST_LOOKED_AT = 1 << 22  # characters of them
 MOST_COMMENTS = 100_000  # lines before the header
 LONGEST_LINE = 1 << 20  # characters of one
+PAIRED_TIME = "Time"  # as columns of time before each channel are called, which have no name
+BRACKETED = re.compile(r"\[(.+?)\]")
 NONE = ("na", "n/a", "#n/a", "null")
 ENCODING_BYTES = 1 << 16  # of a text that say how it is encoded
 
@@ -64,6 +66,10 @@ def read_layout(path: Path) -> Layout:
     rows = [r for r in rows if r]
     if any(len(r) >= LONGEST_LINE for r in (*comments, *rows)):
         raise DataError("log", str(path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
+    pairs = _pairs(rows)
+    if pairs is not None:
+        names, units, start = pairs
+        return Layout(encoding, "\t", names, units, skipped + start, len(names))
     above = _header(rows)
     comments.extend(r for r in rows[:above] if _comment(r))
     rows, skipped = rows[above:], skipped + above
@@ -82,8 +88,8 @@ def read_layout(path: Path) -> Layout:
         units = said.pop() if len(said) == 2 and _units(said[1]) else ()
         names = said[-1] if said else ()
     else:
-        below = _words(rows[1], delimiter) if len(rows) > 2 and _row(_words(rows[2], delimiter)) else ()
-        units = below if len(below) == len(words) and _units(below) else ()
+        below, first_row = (_words(r, delimiter) for r in rows[1:3]) if len(rows) > 2 else ((), ())
+        units = below if len(below) == len(words) and _units(below) and _units_above(below, first_row) else ()
         start += 1 + bool(units)
     columns = len(words)
     written = [w for r in rows[start - skipped :][:-1] if not _comment(r) and any(w := _words(r, delimiter))]
@@ -112,6 +118,26 @@ def _header(rows: list[str]) -> int:
         ):
             return k
     return 0
+
+
+def _pairs(rows: list[str]) -> tuple[tuple[str, ...], tuple[str, ...], int] | None:
+    """(names, units, line of the first row) of a table with a time column before that of each channel, as TwinCAT's
+    Scope writes it: above the numbers each line has a key in the place of each time; None where it is none."""
+    table = [_words(r, "\t") for r in rows]
+    k = next((k for k, w in enumerate(table) if len(w) > 3 and {x.lower() for x in w[::2]} - {""} == {"name"}), None)
+    first = next((m for m, w in enumerate(table) if k is not None and m > k and len(w) > 3 and _row(w)), None)
+    if k is None or first is None:
+        return None
+    columns = len(table[first])
+    channels = table[k][1::2][: columns // 2]
+    told = {w[0].split("[")[0].strip().lower(): w for w in table[k + 1 : first] if len(w) > 1}
+    step = BRACKETED.search(told.get("sampletime", ("",))[0])
+    units = (*told.get("unit", ())[1::2], *[""] * len(channels))[: len(channels)]
+    if columns not in (2 * len(channels), 2 * len(channels) + 1) or not all(channels):
+        return None
+    rest = ("",) * (columns - 2 * len(channels))
+    names = tuple(name for channel in channels for name in (PAIRED_TIME, channel))
+    return names + rest, tuple(u for unit in units for u in (step[1] if step else "", unit)) + rest, first
 
 
 def _as_many(n: int, words: tuple[str, ...]) -> bool:
@@ -179,3 +205,8 @@ def _value(word: str) -> bool:
 def _units(words: tuple[str, ...]) -> bool:
     """Whether words are units: one is known, and none is a number."""
     return any(unit_of(w.strip("[](){}<> ")) for w in words) and not any(_value(w) for w in words if w)
+
+
+def _units_above(units: tuple[str, ...], row: tuple[str, ...]) -> bool:
+    """Whether a row of numbers, some of which may be texts, stands below units: one that is known is above a number."""
+    return _row(row) or any(unit_of(u.strip("[](){}<> ")) and _value(x) for u, x in zip(units, row, strict=False))

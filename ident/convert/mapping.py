@@ -39,6 +39,7 @@ class Column:
         index: column of a two-dimensional source, from 0; None: that of the joint.
         turn: of the source, in its own units, by which it jumps where it wraps; None where it does not.
         plus: (source, factor, index) of further terms: gears that couple joints.
+        geared: whether the gear ratio of the robot is in the factor.
     """
 
     channel: str
@@ -49,6 +50,7 @@ class Column:
     index: int | None
     turn: float | None
     plus: tuple[tuple[str, float, int | None], ...] = ()
+    geared: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -306,4 +308,5 @@ def _column(key: str, entry: Any, ratios: np.ndarray, linear: np.ndarray, where:
             (text(p, "source", here), number(p, "factor", here), whole(p, "index", here, low=0, default=None))
             for p in plus
         ),
+        motor and "gear" not in entry and channel != "temp",
     )

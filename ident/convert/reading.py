@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet
 
+from ident.convert.cells import LABELLED, labels_of
 from ident.convert.dates import as_dates, dates_of_texts, seconds
 from ident.convert.layout import read_layout
-from ident.convert.texts import MOST_CELLS, distinct, read_text, scan_text, text_names, text_units
+from ident.convert.texts import MOST_CELLS, alike, distinct, read_text, scan_text, text_names, text_units
 from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 
 DEEPEST = 8  # structures inside structures that are looked into
 MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
 MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
+CHANGING = np.array([["a", "b"], ["b", "a"]])  # stands for a list of texts that is not the same in all rows
+LONGEST_NAME = 200  # characters
 NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
 Signals = dict[str, np.ndarray]
 Reader = Callable[[Path, set[str] | None], dict[str, Any]]
@@ -37,6 +40,8 @@ class Survey:
         dates: names of those that are dates or times of the day.
         doubts: name -> what is doubtful about how it was read, in words; of those left out as well.
         cut: rows that were read of a log that is longer; else 0.
+        labels: name -> distinct texts of a column that has few.
+        lists: name -> strings of a list of them, which may name columns; empty where it changes from row to row.
     """
 
     signals: Signals
@@ -44,6 +49,8 @@ class Survey:
     dates: frozenset[str]
     doubts: dict[str, str]
     cut: int = 0
+    lists: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Signals:
@@ -75,13 +82,18 @@ def survey_log(path: Path) -> Survey:
         DataError: where the file is missing, of another format or unreadable.
     """
     signals: Signals = {}
-    dates, doubts = set(), {}
+    dates, doubts, lists = set(), {}, {}
+    labels: dict[str, tuple[str, ...]] = {}
     rows = [0]
     text = READERS.get(path.suffix.lower()) is read_text
     for name, value in (
-        _read(path, None, lambda p, _: _surveyed(p, doubts, rows)) if text else _read(path, None)
+        _read(path, None, lambda p, _: _surveyed(p, doubts, labels, rows)) if text else _read(path, None)
     ).items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "OU" and value.ndim == 1:
+            labels[name] = labels_of(value[:LABELLED].tolist())
         x = _array(value)
+        if (strings := _strings(value)) is not None:
+            lists[name] = strings
         if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
         if x.dtype.kind in "Mm":
@@ -89,22 +101,30 @@ def survey_log(path: Path) -> Survey:
             stamps = x.ravel()[~np.isnat(x.ravel())]
             x = seconds(x, stamps[0]) if len(stamps) else np.zeros(0)
         signals[name] = x.astype(float)
-    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0])
+    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0], lists, labels)
 
 
-def _surveyed(path: Path, doubts: dict[str, str], rows: list[int]) -> dict[str, Any]:
-    """Signals of a text, and what is doubtful about them; rows read of one that is longer."""
+def _surveyed(
+    path: Path, doubts: dict[str, str], labels: dict[str, tuple[str, ...]], rows: list[int]
+) -> dict[str, Any]:
+    """Signals of a text, what is doubtful about them, and texts of other columns; rows read of one that is longer."""
     if not read_layout(path).names:
         return read_text(path, None)
     cells = scan_text(path, None)
     if cells and cells[0].rows * len(cells) > MOST_CELLS:
         rows[0] = cells[0].rows
+    labels |= {c.name: c.labels for c in cells if c.labels}
     for c in cells:
         if c.fault is not None:
             doubts[c.name] = f"{c.fault[1][:40]!r} in row {c.fault[0]}"
         elif c.order[1]:
             doubts[c.name] = f"{c.like!r} taken as {'month/day' if c.order[0] == 'mdy' else 'day-month'}"
-    return {c.name: x for c in cells if (x := c.array()) is not None}
+    out: dict[str, np.ndarray] = {}
+    for c in cells:
+        x = c.array()
+        if x is not None and not alike(out.setdefault(c.name, x), x):
+            doubts[c.name] = "several columns that differ"
+    return out
 
 
 def list_signals(path: Path) -> Signals:
@@ -119,6 +139,17 @@ def _array(value: Any) -> np.ndarray | None:
         return dates_of_texts(x) if x.ndim == 1 and x.dtype.kind in "UO" and isinstance(next(iter(x), None), str) else x
     except (TypeError, ValueError, pa.ArrowException):
         return None
+
+
+def _strings(x: Any) -> tuple[str, ...] | None:
+    """The strings of a short list, or of one a row where all are alike; () where they are not; None of all else."""
+    if not isinstance(x, np.ndarray) or x.dtype.kind not in "US" or x.ndim not in (1, 2) or not x.size:
+        return None
+    if not 1 < x.shape[-1] <= MOST_ELEMENTS:
+        return None
+    rows = np.atleast_2d(x)
+    names = rows[0].tolist() if np.all(rows == rows[0]) else ()
+    return tuple((x.decode(errors="replace") if isinstance(x, bytes) else x).strip() for x in names)
 
 
 def _instead(x: np.ndarray | None) -> str:
@@ -175,7 +206,33 @@ def _parquet(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         n: _lists(table.column(n)) if _is_list(table.column(n).type) else as_dates(table.column(n))
         for n in table.column_names
     }
+    if wanted is None:
+        out |= {
+            n: _names(file, n)
+            for n in schema.names
+            if _is_list(kind := schema.field(n).type) and _is_text(kind.value_type)
+        }
     return {n: x for n, x in out.items() if x is not None or wanted is not None}
+
+
+def _names(file: pa.parquet.ParquetFile, name: str) -> np.ndarray | None:
+    """(k,) strings of a list of them that is the same in all rows, as messages name their joints; none where it
+    changes; None where there are too many for joints."""
+    first = None
+    for batch in file.iter_batches(batch_size=1024, columns=[name]):
+        column = batch.column(0)
+        if column.null_count or pc.any(pc.not_equal(pc.list_value_length(column), len(column[0]))).as_py():
+            return CHANGING
+        k = len(column[0])
+        if not 0 < k <= MOST_ELEMENTS:
+            return None
+        codes = pc.list_flatten(column).cast(pa.string()).dictionary_encode()
+        names = np.array([str(v) for v in column[0].as_py()])
+        first = names if first is None else first
+        rows = codes.indices.to_numpy(zero_copy_only=False).reshape(-1, k)
+        if not np.array_equal(names, first) or np.any(rows != rows[0]):
+            return CHANGING
+    return first
 
 
 def _lists(column: pa.ChunkedArray) -> np.ndarray | None:
@@ -189,6 +246,12 @@ def _lists(column: pa.ChunkedArray) -> np.ndarray | None:
 
 def _is_list(kind: pa.DataType) -> bool:
     return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind.value_type if pa.types.is_dictionary(kind) else kind) or pa.types.is_large_string(
+        kind
+    )
 
 
 def _holds_numbers(kind: pa.DataType) -> bool:
@@ -236,6 +299,8 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
         if hasattr(value, "_fieldnames"):
             for key in value._fieldnames if depth < DEEPEST else []:
                 walk(f"{name}.{key}", getattr(value, key), depth + 1)
+        elif _cells_of_texts(value):
+            out[name] = value.ravel().astype(str)
         elif isinstance(value, np.ndarray) and value.dtype == object and value.size and depth < DEEPEST:
             for key, part in _elements(name, value.ravel()):
                 walk(key, part, depth + 1)
@@ -248,6 +313,12 @@ def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return out
 
 
+def _cells_of_texts(value: Any) -> bool:
+    """Whether a value of a MATLAB file is a short list of texts, which may name columns."""
+    cells = isinstance(value, np.ndarray) and value.dtype == object and 0 < value.size <= MOST_ELEMENTS
+    return cells and all(isinstance(v, str) for v in value.ravel())
+
+
 def _elements(name: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
     """Parts of an array of structures or cells, named as MATLAB does; a structure a sample is an array a field."""
     structures = hasattr(array[0], "_fieldnames")
@@ -255,10 +326,10 @@ def _elements(name: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
         brackets = "()" if structures else "{}"
         yield from ((f"{name}{brackets[0]}{k + 1}{brackets[1]}", part) for k, part in enumerate(array))
         return
-    for field in array[0]._fieldnames if structures else ():
-        parts = [np.asarray(getattr(part, field, None)) for part in array]
+    for key in array[0]._fieldnames if structures else ():
+        parts = [np.asarray(getattr(part, key, None)) for part in array]
         if all(p.shape == parts[0].shape and p.dtype.kind in "fiu" for p in parts):
-            yield f"{name}.{field}", np.stack(parts)
+            yield f"{name}.{key}", np.stack(parts)
 
 
 def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
@@ -266,6 +337,7 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
     import h5py
 
     found: dict[str, Any] = {}
+    texts: dict[str, np.ndarray] = {}
     groups, items = set(), 0
 
     def walk(group: Any, start: str, depth: int) -> None:
@@ -288,6 +360,8 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
                 text = item.attrs.get("MATLAB_class", b"") == b"char"
                 if not text and not item.attrs.get("MATLAB_empty", 0):
                     found[dotted] = item
+            elif isinstance(item, h5py.Dataset) and wanted is None and (cells := _hdf5_texts(file, item)) is not None:
+                texts[dotted] = cells
 
     walk(file, "", 0)
     for name, item in found.items():
@@ -295,7 +369,21 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
             raise DataError("signal", str(path), f"{name}, which stands in another file", "one in the file itself")
     check_size(path, sum(item.size * item.dtype.itemsize for item in found.values()))
     # MATLAB's first dimension is the file's last.
-    return {name: np.asarray(item).T for name, item in found.items()}
+    return texts | {name: np.asarray(item).T for name, item in found.items()}
+
+
+def _hdf5_texts(file: Any, item: Any) -> np.ndarray | None:
+    """(k,) texts of the cells of a MATLAB 7.3 file, which refer to them; None where they are none, or too many."""
+    import h5py
+
+    if item.dtype != h5py.ref_dtype or item.external or item.is_virtual or not 0 < item.size <= MOST_ELEMENTS:
+        return None
+    parts = [file[ref] if ref else None for ref in np.asarray(item).ravel()]
+    if not all(isinstance(p, h5py.Dataset) and p.attrs.get("MATLAB_class", b"") == b"char" for p in parts):
+        return None
+    if any(p.external or p.is_virtual or p.size > LONGEST_NAME or p.dtype != np.uint16 for p in parts):
+        return None
+    return np.array(["".join(map(chr, np.asarray(p).ravel())) for p in parts])
 
 
 def _mcap(path: Path, wanted: set[str] | None) -> dict[str, Any]:

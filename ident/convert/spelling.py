@@ -16,6 +16,10 @@ SPELLED = {
     "usec": "us", "ns": "ns", "nsec": "ns", "°c": "degC", "ºc": "degC", "degc": "degC", "celsius": "degC",
 }  # fmt: skip
 BRACKET = re.compile(r"^(.*\S)[\s_.]*[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]\s*$|^(.*\S)\s+/\s+(\S+)\s*$")
+INDEX = re.compile(r"[A-Za-z_ ]*\d+$")
+SHARES = dict.fromkeys(("%", "percent", "pct", "prozent"), 1e-2) | dict.fromkeys(
+    ("‰", "permille", "permil", "promille", "1/1000", "01%"), 1e-3
+)  # without blanks and points: "0.1 %"
 MEGA = ("MNm", "MN")  # not milli
 
 
@@ -23,6 +27,20 @@ def unit_of(text: str) -> str | None:
     """The unit of a map that a text spells: "Nm", "N·m" and "N*m" are "N m"; None where it spells none."""
     bare = re.sub(r"[\s·⋅*]|(?<=[A-Za-z])[.](?=[A-Za-z])|(?<=[Nn])-(?=m)", "", text)
     return None if bare in MEGA else SPELLED.get(bare.lower())
+
+
+def unread_unit(name: str) -> str | None:
+    """What stands at the end of a name as units do, but is none of a map: "%" of "torque (%)"; a number, as in "q(1)"
+    or "q [A1]", is that of a joint."""
+    match = BRACKET.match(name)
+    text = (match[2] or match[4]) if match else None
+    return text if text and not unit_of(text) and not INDEX.match(text) else None
+
+
+def share_of(name: str, unit: str | None) -> float | None:
+    """0.01 or 0.001 where a unit, or a word in a name, says per cent or per mille; else None."""
+    words = (unit or "", *re.split(r"[^A-Za-z%‰]+", name))
+    return next((SHARES[key] for w in words if (key := re.sub(r"[\s_.,-]", "", w.lower())) in SHARES), None)
 
 
 def split_unit(name: str) -> tuple[str, str | None]:

@@ -29,16 +29,18 @@ def read_text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     """Columns (N,) by name, dates among them; one table ``VALUES`` (N, columns) where there is no header.
 
     Raises:
-        DataError: where a signal that is wanted stands in two columns, or a cell of it is none; with its row.
+        DataError: where a signal that is wanted stands in two columns that differ, or a cell of it is none; with its
+            row.
     """
     layout = read_layout(path)
-    names = [wanted_name(n, wanted) for n in layout.names]
-    distinct(names, wanted, path)
-    out = {}
+    out: dict[str, np.ndarray] = {}
     for cells in scan_text(path, wanted):
-        x = cells.array()
-        if x is not None:
-            out[wanted_name(cells.name, wanted)] = x
+        x, name = cells.array(), wanted_name(cells.name, wanted)
+        if x is None:
+            continue
+        if not alike(out.setdefault(name, x), x):
+            found = f"{name} twice, and the columns differ"
+            raise DataError("signal", str(path), found, "each signal once, with one time for all in the file")
     return out if layout.names else _table(out, layout)
 
 
@@ -59,6 +61,11 @@ def scan_text(path: Path, wanted: set[str] | None) -> list[Cells]:
         if wanted is None and (rows * len(cells) > MOST_CELLS or all(c.kind == "texts" for c in cells.values())):
             break
     return list(cells.values())
+
+
+def alike(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two columns (N,) hold the same."""
+    return a is b or (a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True))
 
 
 def wanted_name(name: str, wanted: set[str] | None) -> str:
