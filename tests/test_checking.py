@@ -8,9 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from ident import skew_checks
 from ident.channel_checks import lost_sample_warnings
 from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
+from ident.skew_checks import _far_skew as far_skew
 from ident.skew_checks import link_skew, skew_warnings, torque_skew
 from robot_assets.robot import load_robot
 
@@ -221,6 +223,45 @@ def test_skews_of_less_than_a_sample_are_said_where_they_are_sure(name):
     assert sum(w.startswith("q_link_1") and "2.4 ms after q_1" in w for w in found[0.6]) == 3
     held = [w for w in found[-0.5] if w.startswith("torque")]
     assert len(held) == 3 and all("before the positions" in w and 'input_hold = "zoh"' in w for w in held)
+
+
+@pytest.mark.parametrize("late", [-0.7, -0.217, 0.04, 0.06])
+@pytest.mark.parametrize("name", ["emps", pytest.param("ur10_bare", marks=pytest.mark.slow)])
+def test_torques_far_out_of_step_are_told(name, late):
+    robot = load_robot(name)
+    s = recording(robot, np.random.default_rng(5), late=late)
+    found = torque_skew(s, dataset(robot, s))
+    assert found.sure and found.late == pytest.approx(late, abs=2e-3)
+    order = "after" if late > 0 else "before"
+    (said,) = [w for w in skew_warnings(s, dataset(robot, s)) if w.startswith("torque")]
+    assert f"ms {order} the positions" in said and "shift in [files]" in said
+    assert abs(float(said.split()[2]) - 1e3 * abs(late)) < 2.0
+
+
+def test_nothing_far_out_of_step_is_made_of_torques_that_no_shift_explains(monkeypatch):
+    """Of another run, of wrong signs and order, of one joint alone late, and of a motion that repeats too soon."""
+    searched = []
+    monkeypatch.setattr(skew_checks, "_far_skew", lambda s, d: searched.append(far := far_skew(s, d)) or far)
+    for name in ("emps", "ur10_bare"):
+        robot = load_robot(name)
+        s, other = (recording(robot, np.random.default_rng(k)) for k in (5, 9))
+        wrong = [other.tau, s.tau[::-1], -s.tau, s.tau[:, ::-1]]
+        if robot.n > 1:
+            wrong.append(change(s.tau, 1, lambda x: np.roll(x, 50)))
+        for tau in wrong:
+            assert not torque_skew(replace(s, tau=tau), dataset(robot, s)).sure
+    assert searched
+    # Late by a quarter of a cycle is as early by one and of the other sign.
+    t, robot = np.arange(N) / RATE, load_robot("emps")
+    w = 2 * np.pi * 1.25
+    q, a = (
+        0.02 * np.sin(w * (t - late)) * np.array([1.0, w**2])[k]
+        + 0.004 * np.sin(3 * w * (t - late)) * np.array([1.0, 9 * w**2])[k]
+        for k, late in enumerate((0.0, 0.2))
+    )
+    tau = -90.0 * a[:, None] + 0.1 * np.random.default_rng(0).normal(size=(N, 1))
+    s = Segment("a", "trajectory", "identification", t, tau, q[:, None])
+    assert not torque_skew(s, dataset(robot, s)).sure
 
 
 def test_a_torque_that_is_held_over_a_sample_is_early_by_half_of_it_and_that_is_usual():
