@@ -41,11 +41,13 @@ class Match:
     Attributes:
         correlation: (n, n) of the torque recorded at i with the one needed at j, friction and offset removed.
         slope: (n,) recorded torque over the needed one. size: (n,) rms needed over rms recorded.
+        beside_spring: (n,) correlation of the torques of each joint, what is linear in its position removed too.
     """
 
     correlation: np.ndarray
     slope: np.ndarray
     size: np.ndarray
+    beside_spring: np.ndarray
 
 
 def match_torques(s: Segment, dataset: Dataset) -> Match | None:
@@ -69,16 +71,27 @@ def match_torques(s: Segment, dataset: Dataset) -> Match | None:
         full[k][:, structure.driven] = x
     needed = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(pick))])[:, structure.driven]
     needed = needed + a * dataset.robot.array("motor_inertia")
-    C, slope, size = np.zeros((n, n)), np.zeros(n), np.zeros(n)
+    C, slope, size, beside = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
     for j in range(n):
         own = np.stack([v[:, j], turns[:, j], np.ones(len(v))], axis=1)
-        Q = np.linalg.qr(own / np.maximum(np.linalg.norm(own, axis=0), 1e-300))[0]
-        need, got = (x - Q @ (Q.T @ x) for x in (needed[:, j], tau))
+        need, got = _without(own, needed[:, j]), _without(own, tau)
+        sprung = np.column_stack([own, q[:, j]])
+        beside[j] = _correlation(_without(sprung, needed[:, j]), _without(sprung, tau[:, j]))
         lengths = np.maximum(np.linalg.norm(got, axis=0), 1e-300)
         length = max(float(np.linalg.norm(need)), 1e-300)
         C[:, j] = need @ got / lengths / length
         slope[j], size[j] = C[j, j] * lengths[j] / length, length / lengths[j]
-    return Match(C, slope, size)
+    return Match(C, slope, size, beside)
+
+
+def _without(columns: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """What the columns (N, k) leave of x (N,) or (N, m)."""
+    Q = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
+    return x - Q @ (Q.T @ x)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300))
 
 
 def mislabelled(dataset: Dataset) -> list[str]:
@@ -118,6 +131,8 @@ def contradictions(found: Match, joints: tuple[str, ...]) -> dict[tuple[int, str
     for j in range(len(joints)):
         if j in said or abs(own[j]) < ALIKE:
             continue
+        if own[j] < 0 and found.beside_spring[j] > -ALIKE:
+            continue  # a spring that balances gravity turns its torque over, and leaves that of inertia
         if own[j] < 0:
             out[j, "sign"] = f"{named[j]} runs against what bodies and motor need, {slope[j]:.3g} times it: wrong sign?"
         elif not 1 / FAR < slope[j] < FAR:
@@ -139,8 +154,9 @@ def _doubts(found: Match) -> list[str]:
         out.append(
             f"torques are about {np.median(sure):.2g} times what bodies and motors need: wrong unit, or sample rate?"
         )
-    strange = (own < APART) & (found.size > LARGE[0])
-    against = (own < AGAINST[0]) & (found.size > AGAINST[1])
+    unlike = found.beside_spring < APART
+    strange = (own < APART) & unlike & (found.size > LARGE[0])
+    against = (own < AGAINST[0]) & unlike & (found.size > AGAINST[1])
     if np.sum(strange) > 1 or np.any(strange & (found.size > LARGE[1])) or np.any(against):
         strange |= against
         joints = ", ".join(str(j + 1) for j in np.flatnonzero(strange))

@@ -14,6 +14,7 @@ from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
 from ident.skew_checks import _far_skew as far_skew
 from ident.skew_checks import link_skew, skew_warnings, torque_skew
+from ident.torque_checks import match_torques, torque_warnings
 from robot_assets.robot import load_robot
 
 RATE, N = 500.0, 6000
@@ -388,3 +389,20 @@ def test_what_no_model_is_fitted_to_and_what_no_gain_is_measured_by_is_told(clea
     assert "no gain can be measured" in told(*(s for s in fitted if s.operating_point == fitted[0].operating_point))
     assert "the end of the only motion will be held out" in told(replace(motion, role="identification"))
     assert "excited_lines are not said" in told(*(replace(s, excited_lines=()) for s in fitted))
+
+
+def test_a_spring_that_balances_gravity_is_no_wrong_sign():
+    """A spring at the shoulder that gives three times the torque of gravity turns the sum over; inertia stays."""
+    robot = load_robot("panda_bare")
+    s = recording(robot, np.random.default_rng(1))
+    q, tau = s.q[:, 1], s.tau[:, 1]
+    balanced = tau - 3.0 * np.polyfit(q, tau, 1)[0] * (q - 0.2)
+
+    def with_torque(x):
+        return replace(s, tau=change(s.tau, 1, lambda _: x))
+
+    found = match_torques(with_torque(balanced), dataset(robot, s))
+    assert found.correlation[1, 1] < -0.7 and found.beside_spring[1] > 0.9
+    assert torque_warnings(with_torque(balanced), dataset(robot, s)) == []
+    (said,) = torque_warnings(with_torque(-tau), dataset(robot, s))
+    assert "tau_2 (panda_joint2) runs against" in said
