@@ -14,7 +14,7 @@ from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
 from ident.skew_checks import _far_skew as far_skew
 from ident.skew_checks import link_skew, skew_warnings, torque_skew
-from ident.torque_checks import match_torques, torque_warnings
+from ident.torque_checks import contradictions, match_torques, torque_warnings
 from robot_assets.robot import load_robot
 
 RATE, N = 500.0, 6000
@@ -141,7 +141,22 @@ FAULTS = {
         lambda s: replace(s, tau=s.tau[:, [0, 2, 1, 3, 4, 5]]),
         "tau_2 (shoulder_lift_joint) follows what joint 3 needs",
     ),
-    "a position of the wrong sign": (lambda s: replace(s, q=change(s.q, 1, np.negative), qd=None, q_link=None), "what"),
+    "a position of the wrong sign": (
+        lambda s: replace(s, q=change(s.q, 1, np.negative), qd=None, q_link=None),
+        "which the torques do with q_2 reversed: wrong sign?",
+    ),
+    "a mirrored axis": (
+        lambda s: replace(s, q=change(s.q, 1, np.negative), tau=change(s.tau, 1, np.negative), qd=None, q_link=None),
+        "which the torques do with both q_2 and tau_2 reversed: wrong sign?",
+    ),
+    "all positions of the wrong sign": (
+        lambda s: replace(s, q=-s.q, qd=None, q_link=None),
+        "which the torques do with q_3 reversed: wrong sign?",
+    ),
+    "a position at a base that gravity does not load": (
+        lambda s: replace(s, q=change(s.q, 0, np.negative), qd=None, q_link=None),
+        "tau_1 (shoulder_pan_joint) runs against what bodies and motor need, -0.984 times it: wrong sign of tau_1, or of q_1?",
+    ),
     "link late": (
         lambda s: replace(s, q_link=np.roll(s.q_link, 2, axis=0)),
         "q_link_1 (shoulder_pan_joint) comes 4 ms after",
@@ -406,3 +421,39 @@ def test_a_spring_that_balances_gravity_is_no_wrong_sign():
     assert torque_warnings(with_torque(balanced), dataset(robot, s)) == []
     (said,) = torque_warnings(with_torque(-tau), dataset(robot, s))
     assert "tau_2 (panda_joint2) runs against" in said
+
+
+@pytest.mark.parametrize("quarter", [1, 2, 3])
+def test_another_zero_of_a_joint_that_gravity_loads_is_told(quarter):
+    robot = load_robot("panda_bare")
+    s = recording(robot, np.random.default_rng(1))
+    off = replace(s, q=change(s.q, 3, lambda x: x - quarter * np.pi / 2))
+    (said,) = contradictions(match_torques(off, dataset(robot, s)), robot.joint_names).values()
+    assert f"{90 * quarter} degrees added to q_4" in said and said.endswith("another zero?")
+
+
+def test_what_several_readings_explain_is_told_of_none_alone():
+    """To turn the axes before and after by half a turn mirrors the one between, and the first one bears no gravity."""
+    robot = load_robot("panda_bare")
+    s = recording(robot, np.random.default_rng(1))
+    mirrored = replace(s, q=change(s.q, 1, np.negative), tau=change(s.tau, 1, np.negative))
+    (said,) = contradictions(match_torques(mirrored, dataset(robot, s)), robot.joint_names).values()
+    assert "with both q_2 and tau_2 reversed, or with 180 degrees added to q_3: wrong sign or another zero?" in said
+
+
+@pytest.mark.parametrize("name", ["emps", "ur10_bare", "panda_bare"])
+def test_sound_torques_and_those_that_no_sign_explains_are_read_as_recorded(name):
+    """Of bodies that are a third off, with stiction, springs and noise of their own, and of another motion."""
+    robot, rng = load_robot(name), np.random.default_rng(3)
+    s, other = recording(robot, np.random.default_rng(4)), recording(robot, np.random.default_rng(5))
+    size = s.tau.std(axis=0)
+    spring = 2.0 * size / s.q.std(axis=0) * (s.q - 0.1) * rng.choice([-1, 1], robot.n)
+    for tau in (
+        s.tau,
+        s.tau * rng.uniform(0.6, 1.6, robot.n),
+        s.tau + 0.5 * size * np.sign(s.qd),
+        s.tau + spring,
+        s.tau + size * rng.normal(size=s.tau.shape),
+        other.tau,
+    ):
+        assert match_torques(replace(s, tau=tau), dataset(robot, s)).readings == {}
