@@ -21,6 +21,10 @@ CLIPPED = 3e-3  # share of the samples at the very largest value, in runs of thr
 SMOOTH = 1e-5  # torque noise over torque rms, below which a log was filtered
 MOVES = 3.0  # standard deviation of a position over its noise
 LOW_SHARE = 0.1  # of the sample rate
+ALIKE = 3  # samples in all channels, and times as many as are alike all along, that are a freeze in motion
+ASIDE = 0.02  # s at most before and after such samples, in which the motion goes on,
+ABRUPT = 2.0  # times as far as accelerations change it elsewhere
+REGULAR = 0.8  # share of the samples that are alike in one number, where a log is faster than what it records
 
 
 def velocity(s: Segment, rate: float) -> np.ndarray:
@@ -137,6 +141,56 @@ def _runs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Starts and lengths of the runs of equal values."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0) + 1])
     return starts, np.diff(np.concatenate([starts, [len(x)]]))
+
+
+def freeze_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Stretches in which all positions and torques stand still at once amid a motion, and logs of repeated samples."""
+    rate, rows = dataset.sample_rate, np.concatenate([s.q, s.tau], axis=1)
+    if len(rows) < 64 or not np.any(np.ptp(s.q, axis=0) > 0):
+        return []
+    edges = np.flatnonzero(np.any(np.diff(rows, axis=0) != 0, axis=1)) + 1
+    starts = np.concatenate([[0], edges])
+    lengths = np.diff(np.concatenate([starts, [len(rows)]]))
+    usual = int(np.median(lengths))
+    out = []
+    if usual > 1 and np.mean(np.abs(lengths - usual) <= 1) > REGULAR:
+        out.append(
+            f"all channels change every {usual} samples only: measured at {rate / usual:.4g} Hz and logged at {rate:.4g} Hz?"
+        )
+    long = lengths >= ALIKE * usual
+    still = np.repeat(long & (lengths < len(rows)), lengths)
+    found = [
+        (int(a), int(k))
+        for a, k in zip(starts[long], lengths[long], strict=True)
+        if _amid_motion(s.q, a, a + k, still, rate)
+    ]
+    if found:
+        a, k = max(found, key=lambda run: run[1])
+        others = f"; {len(found)} such stretches, {sum(n for _, n in found)} samples in all" if len(found) > 1 else ""
+        out.append(
+            f"all channels stand still at once for {k} samples, {k / rate:.3g} s from {s.t[a]:.4g} s on, in motion: the log froze{others}"
+        )
+    return out
+
+
+def _amid_motion(q: np.ndarray, a: int, b: int, still: np.ndarray, rate: float) -> bool:
+    """Whether some joint moves on in one direction before sample ``a`` and after ``b - 1``, too fast to have stopped.
+
+    Args:
+        q: (N, n) rad or m, the same from ``a`` to ``b - 1``. still: (N,) samples of no change at all.
+    """
+    near = min(b - a, max(2, round(ASIDE * rate)))
+    if a < near or b + near >= len(q):
+        return False
+    before, after = q[a] - q[a - near], q[b + near] - q[b]
+    # What accelerations and noise change within as many samples, where the log runs.
+    runs = ~(still[: -2 * near] | still[near:-near] | still[2 * near :])
+    bend = np.abs(q[: -2 * near] - 2 * q[near:-near] + q[2 * near :])[runs]
+    if len(bend) < 32:
+        return False
+    resolution = np.array([_resolution(x) for x in np.diff(q, axis=0).T])
+    least = ABRUPT * np.maximum(np.percentile(bend, 99, axis=0), resolution)
+    return bool(np.any((before * after > 0) & (np.minimum(np.abs(before), np.abs(after)) > least)))
 
 
 def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:

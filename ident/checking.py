@@ -12,6 +12,7 @@ import numpy as np
 from ident.channel_checks import (
     excitation_warnings,
     filled_warnings,
+    freeze_warnings,
     lost_sample_warnings,
     stuck_warnings,
     unit_warnings,
@@ -30,6 +31,7 @@ CHECKS = (
     period_warnings,
     unit_warnings,
     stuck_warnings,
+    freeze_warnings,
     lost_sample_warnings,
     skew_warnings,
     excitation_warnings,

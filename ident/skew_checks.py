@@ -13,7 +13,12 @@ from ident.chain import Structure, build_structure
 from ident.dataset import Dataset, Segment
 from ident.rest import difference_noise
 
-LATEST = 0.03  # s: skews are looked for up to here
+LATEST = 0.03  # s: skews are looked for up to here from none,
+FARTHEST = 1.0, 0.1  # s and share of the log: up to here, where torques are not explained so
+GRID = 0.01  # s from one of these skews to the next
+VALLEY = 0.1  # s about the best of them: it is unique where all beyond leave
+UNIQUE = 8.0  # times as much as it does, at least,
+FAR_GONE = 0.875  # and where so much of what was unexplained goes with it
 ODD = 1.0  # samples: skews of less are common, and are said only where
 SMALL = 0.25, 1e-4  # samples and s: they are larger than both, and what they differ by from usual is sure too
 HELD = 0.5  # samples by which a torque that is held over a sample is recorded early
@@ -56,13 +61,42 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
     motion, and one that is gone without one of the joints is no skew of the channels, but an effect of that joint. It
     is a cross-correlation in which inertia, gravity and friction have their place.
     """
-    rate, n = dataset.sample_rate, dataset.n
+    near = _fit(s, dataset, 0.0)
+    return near if near is not None else _far_skew(s, dataset)
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """What the torques of a motion are a linear combination of.
+
+    Attributes:
+        A: (rows, columns) of those of the samples looked at that move. rows: which of ``pick`` x joints these are.
+        tau: (N, n) in the low band, over ``scale`` (n,). pick: samples looked at. keep: (len(pick), n) that move.
+    """
+
+    A: np.ndarray
+    rows: np.ndarray
+    tau: np.ndarray
+    scale: np.ndarray
+    pick: np.ndarray
+    keep: np.ndarray
+    every: int
+
+    def torque(self, late: float, rate: float) -> np.ndarray:
+        """(len(pick), n) torque of so many seconds later."""
+        time = np.arange(len(self.tau)) / rate
+        return np.stack([np.interp(time[self.pick] + late, time, x) for x in self.tau.T], axis=1) / self.scale
+
+
+def _sums(s: Segment, dataset: Dataset, margin: float) -> _Sums | None:
+    """Torques and their columns, ``margin`` s from the ends at least; None where nothing can be told."""
+    rate = dataset.sample_rate
     q, tau, v, a = _band(s, rate)
     every = max(1, int(rate / (5 * BAND)), len(q) // LONGEST)
-    edge = int(rate * SETTLED) + 1
+    edge = int(rate * margin) + 1
     pick = np.arange(edge, len(q) - edge, every)
     if len(pick) < 40 * BLOCKS // 2 or not np.any(np.ptp(v, axis=0) > 0):
-        return UNKNOWN
+        return None
     structure = build_structure(dataset.robot)
     # Friction turns over within a sample, the torque in its band does not: both pass the same filter.
     turns = _low(np.sign(v), rate)
@@ -71,28 +105,39 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
     keep = np.abs(v[pick]) > MOVING * np.maximum(np.abs(v).max(axis=0), 1e-300)
     size = np.linalg.norm(B.reshape(-1, B.shape[2]), axis=0)
     B = B[:, :, size > 1e-9 * size.max()] / size[size > 1e-9 * size.max()] / scale[:, None]
-    rows = keep.ravel()
+    return _Sums(B.reshape(-1, B.shape[2]), keep.ravel(), tau, scale, pick, keep, every)
+
+
+def _fit(s: Segment, dataset: Dataset, start: float, margin: float = SETTLED, least: float = np.inf) -> Skew | None:
+    """The skew found from ``start`` s on; None where none within ``LATEST`` of it explains the torques.
+
+    ``least``: what it may leave unexplained at most, in squares of torques over their deviations.
+    """
+    rate, n = dataset.sample_rate, dataset.n
+    sums = _sums(s, dataset, margin)
+    if sums is None:
+        return UNKNOWN
+    A, rows, pick = sums.A, sums.rows, sums.pick
     block = np.repeat(np.arange(len(pick)) * BLOCKS // len(pick), n)[rows]
-    A = B.reshape(-1, B.shape[2])
-    late, time = 0.0, np.arange(len(tau)) / rate
+    late = start
     unexplained = []
     for _ in range(8):
-        y = np.stack([np.interp(time[pick] + late, time, x) for x in tau.T], axis=1) / scale
+        y = sums.torque(late, rate)
         x = np.linalg.lstsq(A[rows], y.ravel()[rows], rcond=RANK)[0]
         fit = (A @ x).reshape(y.shape)
         unexplained.append(float(np.sum((y - fit).ravel()[rows] ** 2)))
-        slope = np.gradient(fit, every / rate, axis=0).ravel()[rows]
+        slope = np.gradient(fit, sums.every / rate, axis=0).ravel()[rows]
         step = _shift(A[rows], slope, y.ravel()[rows])
         late = late - step
-        if abs(late) > LATEST:
-            return UNKNOWN
+        if abs(late - start) > LATEST:
+            return None
         if abs(step) < 1e-6:
             break
-    if unexplained[-1] > (1.0 - EXPLAINED) * np.sum((y - y.mean(axis=0)).ravel()[rows] ** 2):
-        return UNKNOWN
+    if unexplained[-1] > min(least, (1.0 - EXPLAINED) * np.sum((y - y.mean(axis=0)).ravel()[rows] ** 2)):
+        return None
     skew = Skew(float(late), _spread(A[rows], slope, y.ravel()[rows], block))
-    noise = float(np.sum(keep * (difference_noise(s.tau) / scale) ** 2)) * _passed(rate)
-    if skew.sure and unexplained[-1] > max((1.0 - GONE) * unexplained[0], NOTHING * noise):
+    noise = float(np.sum(sums.keep * (difference_noise(s.tau) / sums.scale) ** 2)) * _passed(rate)
+    if start == 0.0 and skew.sure and unexplained[-1] > max((1.0 - GONE) * unexplained[0], NOTHING * noise):
         return UNKNOWN
     at = np.tile(np.arange(n), len(pick))[rows]
     for j in range(n) if skew.sure and n > 1 else ():
@@ -105,6 +150,29 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
         if not abs(without - late) < ONE_JOINT * abs(late):
             return UNKNOWN
     return skew
+
+
+def _far_skew(s: Segment, dataset: Dataset) -> Skew:
+    """A skew of up to ``FARTHEST``, where one alone explains the torques; motions that repeat sooner tell none."""
+    rate = dataset.sample_rate
+    reach = min(FARTHEST[0], FARTHEST[1] * len(s.t) / rate)
+    sums = _sums(s, dataset, SETTLED + reach)
+    if sums is None or reach < VALLEY:
+        return UNKNOWN
+    lags = np.arange(-round(reach / GRID) + 3, round(reach / GRID) - 2) * GRID
+    U, sv, _ = np.linalg.svd(sums.A[sums.rows], full_matrices=False)
+    U = U[:, sv > RANK * sv[0]]
+    left = []
+    for late in lags:
+        y = sums.torque(late, rate).ravel()[sums.rows]
+        left.append(float(np.sum((y - U @ (U.T @ y)) ** 2)))
+    k = int(np.argmin(left))
+    others = np.array(left)[np.abs(lags - lags[k]) > VALLEY]
+    least = min(float(others.min()) / UNIQUE, (1.0 - FAR_GONE) * left[int(np.argmin(np.abs(lags)))])
+    if not 0 < k < len(lags) - 1 or abs(lags[k]) < GRID / 2:
+        return UNKNOWN
+    found = _fit(s, dataset, float(lags[k]), SETTLED + reach, least)
+    return found if found is not None and abs(found.late) > LATEST else UNKNOWN
 
 
 def _torque_columns(structure: Structure, q: np.ndarray, v: np.ndarray, a: np.ndarray, turns: np.ndarray) -> np.ndarray:
@@ -204,10 +272,15 @@ def skew_warnings(s: Segment, dataset: Dataset) -> list[str]:
         (f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k, 0.0) for j, k in enumerate(link_skew(s, dataset))
     ]
     return [
-        f"{what} comes {abs(k.late) * 1e3:.2g} ms {'after' if k.late > 0 else 'before'} {other} (± {k.std * 1e3:.1g} ms): {_reason(what, k.late, usual, rate)}"
+        f"{what} comes {_ms(k.late)} ms {'after' if k.late > 0 else 'before'} {other} (± {k.std * 1e3:.1g} ms): {_reason(what, k.late, usual, rate)}"
         for what, other, k, usual in named
         if _said(k, usual, rate)
     ]
+
+
+def _ms(late: float) -> str:
+    """The size of a skew, s, in milliseconds."""
+    return f"{abs(late) * 1e3:{'.3g' if abs(late) > LATEST else '.2g'}}"
 
 
 def _said(skew: Skew, usual: float, rate: float) -> bool:
@@ -217,5 +290,7 @@ def _said(skew: Skew, usual: float, rate: float) -> bool:
 
 
 def _reason(what: str, late: float, usual: float, rate: float) -> str:
+    if abs(late) > LATEST:
+        return "channels of clocks that are not in step (shift in [files] of a map moves one)?"
     held = what == "torque" and usual == 0.0 and abs(late * rate + HELD) < SMALL[0]
     return 'held over a sample (input_hold = "zoh")?' if held else "channels sampled at different times?"

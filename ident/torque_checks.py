@@ -11,12 +11,13 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 import scipy.signal
 
 from ident.chain import build_structure
 from ident.channel_checks import anti_resonance
 from ident.dataset import Dataset, Segment
+from ident.label_fits import Motion, Reading, correlation, other_readings, said_of, without
+from robot_assets.robot import linear_joints
 
 SEGMENTS = 6  # of a dataset, that a diagnosis looks at
 BAND = 12.0  # Hz, at most: below, links follow their motors
@@ -28,6 +29,7 @@ ALIKE = 0.7  # correlation above which sizes are compared
 APART = 0.6  # correlation below which two torques have little to do with each other
 FAR = 8.0  # ratio of sizes that no error of a drive or a body explains
 ALL = 2.5  # the same, of the middle joint
+SEEN = 0.3  # size of what is needed over what was recorded, from which a joint tells that signs are wrong
 LARGE = 0.6, 2.0  # size of what is needed over what was recorded, at two joints or more, or at one
 NOTHING = 0.3  # correlation below which, at all joints, torques have nothing to do with the motion
 AGAINST = -0.2, 0.5  # correlation below and size above which one joint is enough
@@ -41,11 +43,15 @@ class Match:
     Attributes:
         correlation: (n, n) of the torque recorded at i with the one needed at j, friction and offset removed.
         slope: (n,) recorded torque over the needed one. size: (n,) rms needed over rms recorded.
+        beside_spring: (n,) correlation of the torques of each joint, what is linear in its position removed too.
+        readings: joint -> (joint, signs and zero) that explain the torques, where those recorded do not.
     """
 
     correlation: np.ndarray
     slope: np.ndarray
     size: np.ndarray
+    beside_spring: np.ndarray
+    readings: dict[int, tuple[tuple[int, Reading], ...]]
 
 
 def match_torques(s: Segment, dataset: Dataset) -> Match | None:
@@ -63,22 +69,36 @@ def match_torques(s: Segment, dataset: Dataset) -> Match | None:
     turns = scipy.signal.sosfiltfilt(low, np.sign(v), axis=0)[pick]
     a = np.gradient(v, 1 / rate, axis=0)[pick]
     q, tau, v = q[pick], tau[pick], v[pick]
-    structure = build_structure(dataset.robot)
-    data, full = structure.model.createData(), np.zeros((3, len(pick), structure.model.nv))
-    for k, x in enumerate((q, v, a)):
-        full[k][:, structure.driven] = x
-    needed = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(pick))])[:, structure.driven]
-    needed = needed + a * dataset.robot.array("motor_inertia")
-    C, slope, size = np.zeros((n, n)), np.zeros(n), np.zeros(n)
+    robot = dataset.robot
+    linear, inertia = np.array(linear_joints(robot)), robot.array("motor_inertia")
+    m = Motion(q, v, a, tau, turns, build_structure(robot), linear, inertia)
+    needed = m.needed(q, v, a)
+    C, slope, size, beside = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
     for j in range(n):
-        own = np.stack([v[:, j], turns[:, j], np.ones(len(v))], axis=1)
-        Q = np.linalg.qr(own / np.maximum(np.linalg.norm(own, axis=0), 1e-300))[0]
-        need, got = (x - Q @ (Q.T @ x) for x in (needed[:, j], tau))
+        need, got = without(m.own(j), needed[:, j]), without(m.own(j), tau)
+        sprung = m.own(j, spring=True)
+        beside[j] = correlation(without(sprung, needed[:, j]), without(sprung, tau[:, j]))
         lengths = np.maximum(np.linalg.norm(got, axis=0), 1e-300)
         length = max(float(np.linalg.norm(need)), 1e-300)
         C[:, j] = need @ got / lengths / length
         slope[j], size[j] = C[j, j] * lengths[j] / length, length / lengths[j]
-    return Match(C, slope, size)
+    doubtful = np.any((beside < APART) & (size > SEEN)) and not _crossed(C)
+    return Match(C, slope, size, beside, other_readings(m) if doubtful else {})
+
+
+def _crossed(C: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of joints whose torques follow each what the other needs; a joint is in one pair."""
+    own, out = np.diag(C), []
+    said: set[int] = set()
+    for i in range(len(C)):
+        for k in range(i):
+            crossed = min(C[i, k], C[k, i]) > ALIKE and all(
+                1 - c**2 < BETTER * (1 - o**2) for c, o in ((C[i, k], own[i]), (C[k, i], own[k]))
+            )
+            if crossed and not said & {i, k}:
+                said |= {i, k}
+                out.append((k, i))
+    return out
 
 
 def mislabelled(dataset: Dataset) -> list[str]:
@@ -105,19 +125,20 @@ def contradictions(found: Match, joints: tuple[str, ...]) -> dict[tuple[int, str
     named = [f"tau_{j + 1} ({name})" for j, name in enumerate(joints)]
     out: dict[tuple[int, str], str] = {}
     said: set[int] = set()
-    for i in range(len(joints)):
-        for k in range(i):
-            crossed = min(C[i, k], C[k, i]) > ALIKE and all(
-                1 - c**2 < BETTER * (1 - o**2) for c, o in ((C[i, k], own[i]), (C[k, i], own[k]))
-            )
-            if crossed and not said & {i, k}:
-                said |= {i, k}
-                out[k, "swapped"] = (
-                    f"{named[k]} follows what joint {i + 1} needs and tau_{i + 1} what joint {k + 1} needs: columns swapped?"
-                )
+    for k, i in _crossed(C):
+        said |= {i, k}
+        out[k, "swapped"] = (
+            f"{named[k]} follows what joint {i + 1} needs and tau_{i + 1} what joint {k + 1} needs: columns swapped?"
+        )
+    for j, ways in found.readings.items():
+        out[j, "sign"] = said_of(j, joints, ways, float(slope[j]))
+    if found.readings:  # with these, the torques of the other joints are what they should be
+        said |= set(range(len(joints)))
     for j in range(len(joints)):
         if j in said or abs(own[j]) < ALIKE:
             continue
+        if own[j] < 0 and found.beside_spring[j] > -ALIKE:
+            continue  # a spring that balances gravity turns its torque over, and leaves that of inertia
         if own[j] < 0:
             out[j, "sign"] = f"{named[j]} runs against what bodies and motor need, {slope[j]:.3g} times it: wrong sign?"
         elif not 1 / FAR < slope[j] < FAR:
@@ -139,8 +160,9 @@ def _doubts(found: Match) -> list[str]:
         out.append(
             f"torques are about {np.median(sure):.2g} times what bodies and motors need: wrong unit, or sample rate?"
         )
-    strange = (own < APART) & (found.size > LARGE[0])
-    against = (own < AGAINST[0]) & (found.size > AGAINST[1])
+    unlike = found.beside_spring < APART
+    strange = (own < APART) & unlike & (found.size > LARGE[0])
+    against = (own < AGAINST[0]) & unlike & (found.size > AGAINST[1])
     if np.sum(strange) > 1 or np.any(strange & (found.size > LARGE[1])) or np.any(against):
         strange |= against
         joints = ", ".join(str(j + 1) for j in np.flatnonzero(strange))

@@ -8,10 +8,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from ident import skew_checks
 from ident.channel_checks import lost_sample_warnings
 from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
+from ident.skew_checks import _far_skew as far_skew
 from ident.skew_checks import link_skew, skew_warnings, torque_skew
+from ident.torque_checks import contradictions, match_torques, torque_warnings
 from robot_assets.robot import load_robot
 
 RATE, N = 500.0, 6000
@@ -138,7 +141,22 @@ FAULTS = {
         lambda s: replace(s, tau=s.tau[:, [0, 2, 1, 3, 4, 5]]),
         "tau_2 (shoulder_lift_joint) follows what joint 3 needs",
     ),
-    "a position of the wrong sign": (lambda s: replace(s, q=change(s.q, 1, np.negative), qd=None, q_link=None), "what"),
+    "a position of the wrong sign": (
+        lambda s: replace(s, q=change(s.q, 1, np.negative), qd=None, q_link=None),
+        "which the torques do with q_2 reversed: wrong sign?",
+    ),
+    "a mirrored axis": (
+        lambda s: replace(s, q=change(s.q, 1, np.negative), tau=change(s.tau, 1, np.negative), qd=None, q_link=None),
+        "which the torques do with both q_2 and tau_2 reversed: wrong sign?",
+    ),
+    "all positions of the wrong sign": (
+        lambda s: replace(s, q=-s.q, qd=None, q_link=None),
+        "which the torques do with q_3 reversed: wrong sign?",
+    ),
+    "a position at a base that gravity does not load": (
+        lambda s: replace(s, q=change(s.q, 0, np.negative), qd=None, q_link=None),
+        "tau_1 (shoulder_pan_joint) runs against what bodies and motor need, -0.984 times it: wrong sign of tau_1, or of q_1?",
+    ),
     "link late": (
         lambda s: replace(s, q_link=np.roll(s.q_link, 2, axis=0)),
         "q_link_1 (shoulder_pan_joint) comes 4 ms after",
@@ -221,6 +239,45 @@ def test_skews_of_less_than_a_sample_are_said_where_they_are_sure(name):
     assert sum(w.startswith("q_link_1") and "2.4 ms after q_1" in w for w in found[0.6]) == 3
     held = [w for w in found[-0.5] if w.startswith("torque")]
     assert len(held) == 3 and all("before the positions" in w and 'input_hold = "zoh"' in w for w in held)
+
+
+@pytest.mark.parametrize("late", [-0.7, -0.217, 0.04, 0.06])
+@pytest.mark.parametrize("name", ["emps", pytest.param("ur10_bare", marks=pytest.mark.slow)])
+def test_torques_far_out_of_step_are_told(name, late):
+    robot = load_robot(name)
+    s = recording(robot, np.random.default_rng(5), late=late)
+    found = torque_skew(s, dataset(robot, s))
+    assert found.sure and found.late == pytest.approx(late, abs=2e-3)
+    order = "after" if late > 0 else "before"
+    (said,) = [w for w in skew_warnings(s, dataset(robot, s)) if w.startswith("torque")]
+    assert f"ms {order} the positions" in said and "shift in [files]" in said
+    assert abs(float(said.split()[2]) - 1e3 * abs(late)) < 2.0
+
+
+def test_nothing_far_out_of_step_is_made_of_torques_that_no_shift_explains(monkeypatch):
+    """Of another run, of wrong signs and order, of one joint alone late, and of a motion that repeats too soon."""
+    searched = []
+    monkeypatch.setattr(skew_checks, "_far_skew", lambda s, d: searched.append(far := far_skew(s, d)) or far)
+    for name in ("emps", "ur10_bare"):
+        robot = load_robot(name)
+        s, other = (recording(robot, np.random.default_rng(k)) for k in (5, 9))
+        wrong = [other.tau, s.tau[::-1], -s.tau, s.tau[:, ::-1]]
+        if robot.n > 1:
+            wrong.append(change(s.tau, 1, lambda x: np.roll(x, 50)))
+        for tau in wrong:
+            assert not torque_skew(replace(s, tau=tau), dataset(robot, s)).sure
+    assert searched
+    # Late by a quarter of a cycle is as early by one and of the other sign.
+    t, robot = np.arange(N) / RATE, load_robot("emps")
+    w = 2 * np.pi * 1.25
+    q, a = (
+        0.02 * np.sin(w * (t - late)) * np.array([1.0, w**2])[k]
+        + 0.004 * np.sin(3 * w * (t - late)) * np.array([1.0, 9 * w**2])[k]
+        for k, late in enumerate((0.0, 0.2))
+    )
+    tau = -90.0 * a[:, None] + 0.1 * np.random.default_rng(0).normal(size=(N, 1))
+    s = Segment("a", "trajectory", "identification", t, tau, q[:, None])
+    assert not torque_skew(s, dataset(robot, s)).sure
 
 
 def test_a_torque_that_is_held_over_a_sample_is_early_by_half_of_it_and_that_is_usual():
@@ -347,3 +404,56 @@ def test_what_no_model_is_fitted_to_and_what_no_gain_is_measured_by_is_told(clea
     assert "no gain can be measured" in told(*(s for s in fitted if s.operating_point == fitted[0].operating_point))
     assert "the end of the only motion will be held out" in told(replace(motion, role="identification"))
     assert "excited_lines are not said" in told(*(replace(s, excited_lines=()) for s in fitted))
+
+
+def test_a_spring_that_balances_gravity_is_no_wrong_sign():
+    """A spring at the shoulder that gives three times the torque of gravity turns the sum over; inertia stays."""
+    robot = load_robot("panda_bare")
+    s = recording(robot, np.random.default_rng(1))
+    q, tau = s.q[:, 1], s.tau[:, 1]
+    balanced = tau - 3.0 * np.polyfit(q, tau, 1)[0] * (q - 0.2)
+
+    def with_torque(x):
+        return replace(s, tau=change(s.tau, 1, lambda _: x))
+
+    found = match_torques(with_torque(balanced), dataset(robot, s))
+    assert found.correlation[1, 1] < -0.7 and found.beside_spring[1] > 0.9
+    assert torque_warnings(with_torque(balanced), dataset(robot, s)) == []
+    (said,) = torque_warnings(with_torque(-tau), dataset(robot, s))
+    assert "tau_2 (panda_joint2) runs against" in said
+
+
+@pytest.mark.parametrize("quarter", [1, 2, 3])
+def test_another_zero_of_a_joint_that_gravity_loads_is_told(quarter):
+    robot = load_robot("panda_bare")
+    s = recording(robot, np.random.default_rng(1))
+    off = replace(s, q=change(s.q, 3, lambda x: x - quarter * np.pi / 2))
+    (said,) = contradictions(match_torques(off, dataset(robot, s)), robot.joint_names).values()
+    assert f"{90 * quarter} degrees added to q_4" in said and said.endswith("another zero?")
+
+
+def test_what_several_readings_explain_is_told_of_none_alone():
+    """To turn the axes before and after by half a turn mirrors the one between, and the first one bears no gravity."""
+    robot = load_robot("panda_bare")
+    s = recording(robot, np.random.default_rng(1))
+    mirrored = replace(s, q=change(s.q, 1, np.negative), tau=change(s.tau, 1, np.negative))
+    (said,) = contradictions(match_torques(mirrored, dataset(robot, s)), robot.joint_names).values()
+    assert "with both q_2 and tau_2 reversed, or with 180 degrees added to q_3: wrong sign or another zero?" in said
+
+
+@pytest.mark.parametrize("name", ["emps", "ur10_bare", "panda_bare"])
+def test_sound_torques_and_those_that_no_sign_explains_are_read_as_recorded(name):
+    """Of bodies that are a third off, with stiction, springs and noise of their own, and of another motion."""
+    robot, rng = load_robot(name), np.random.default_rng(3)
+    s, other = recording(robot, np.random.default_rng(4)), recording(robot, np.random.default_rng(5))
+    size = s.tau.std(axis=0)
+    spring = 2.0 * size / s.q.std(axis=0) * (s.q - 0.1) * rng.choice([-1, 1], robot.n)
+    for tau in (
+        s.tau,
+        s.tau * rng.uniform(0.6, 1.6, robot.n),
+        s.tau + 0.5 * size * np.sign(s.qd),
+        s.tau + spring,
+        s.tau + size * rng.normal(size=s.tau.shape),
+        other.tau,
+    ):
+        assert match_torques(replace(s, tau=tau), dataset(robot, s)).readings == {}

@@ -9,6 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
+from ident.channel_checks import freeze_warnings
+from ident.checking import inspect_dataset
 from ident.convert import convert_logs
 from ident.convert.reading import list_signals
 from ident.dataset import Dataset, Segment
@@ -321,3 +323,57 @@ def test_what_cells_of_matlab_hold_is_not_looked_at_one_by_one(tmp_path):
         for k in range(2500):
             file[f"#refs#/{k}"] = 0.0
     assert list(list_signals(tmp_path / "log.mat")) == ["log.q"]
+
+
+def moves(seconds=20.0, rate=500.0, every=1):
+    """A motion of the bench with a rest, positions by an encoder of 1e-5 rad and torques in steps of 1e-4 N m, of
+    which the log repeats each ``every`` times."""
+    t = np.arange(int(seconds * rate)) / rate
+    slow = t[np.arange(len(t)) // every * every]
+    run = np.clip(slow, 0, 8) + np.clip(slow - 10, 0, None)  # at rest from 8 to 10 s, after a turn
+    q = 0.6 * np.cos(2 * np.pi * 0.5 * run) + 0.1 * np.cos(2 * np.pi * 1.5 * run)
+    tau = 0.05 * np.cos(2 * np.pi * 0.5 * run + 0.3)
+    return t, np.round(q, 5)[:, None], np.round(tau, 4)[:, None]
+
+
+def of_the_bench(t, q, tau, rate=500.0):
+    bench = load_robot("twomass")
+    s = Segment("log", "trajectory", "identification", t, tau, q)
+    return s, Dataset("moves", bench, rate, bench.joint_names, "none", None, None, None, (s,))
+
+
+@pytest.mark.parametrize(("every", "samples"), [(1, 4), (1, 40), (1, 100), (2, 40)])
+def test_a_log_that_froze_in_motion_is_told_with_its_place(every, samples):
+    t, q, tau = moves(every=every)
+    at = 2120
+    q[at : at + samples], tau[at : at + samples] = q[at], tau[at]
+    s, data = of_the_bench(t, q, tau)
+    (found,) = [w for w in freeze_warnings(s, data) if "froze" in w]
+    first, seconds = (float(found.split(before)[1].split()[0]) for before in ("for ", "samples, "))
+    assert samples <= first <= samples + 1 and seconds == pytest.approx(samples / 500, abs=0.003)
+    assert "from 4.24 s on" in found
+    assert any(found in w for w in inspect_dataset(data).warnings)
+    more = q.copy(), tau.copy()
+    for x in more:
+        x[3120 : 3120 + samples] = x[3120]
+    twice = [w for w in freeze_warnings(*of_the_bench(t, *more)) if "froze" in w]
+    assert "2 such stretches" in twice[0]
+
+
+def test_rests_slow_channels_and_repeated_samples_are_no_freezes():
+    rng = np.random.default_rng(0)
+    t, q, tau = moves()
+    assert freeze_warnings(*of_the_bench(t, q, tau)) == []
+    coarse = np.round(q, 3), np.round(tau, 3)
+    assert freeze_warnings(*of_the_bench(t, *coarse)) == []
+    slow = tau[np.arange(len(t)) // 10 * 10]
+    assert freeze_warnings(*of_the_bench(t, q, slow)) == []
+    one = q.copy()
+    one[2120:2160] = one[2120]  # torques go on: a fault of an encoder, which is told by itself
+    assert freeze_warnings(*of_the_bench(t, one, tau + 1e-3 * rng.normal(size=tau.shape))) == []
+    # A start in the middle of a motion, and a motion in steps that stops within some samples.
+    ramp = np.interp(t % 1.0, [0.0, 0.02, 0.46, 0.5, 1.0], [0.0, 0.01, 0.48, 0.5, 0.5]) + 0.5 * np.floor(t)
+    assert freeze_warnings(*of_the_bench(t, np.round(ramp, 5)[:, None] % 6, np.sign(np.round(tau, 4)))) == []
+    for every in (2, 5):
+        (told,) = freeze_warnings(*of_the_bench(*moves(every=every)))
+        assert told.startswith(f"all channels change every {every} samples only: measured at {500 / every:g} Hz")
