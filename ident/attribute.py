@@ -166,7 +166,7 @@ def attribute(
             current, more = companions(problem, current, best, hypotheses)
             rounds += more
         effects = current.model.effects
-        current = plainer(problem, current, hypotheses, set())
+        current = plainer(problem, current, hypotheses, set(), rounds)
         rounds = renamed(rounds, effects, current.model.effects)
         taken = {e.hypothesis.key for e in (*effects, *current.model.effects)}
         current = pruned(problem, current)
@@ -208,7 +208,7 @@ def at_the_end(
     # What a cause had that sets it apart from its special case may have been what one that was found later does.
     itself = [e for e in effects if not (plainly_special(problem, current.model, e) or untold(current, e))]
     if len(itself) < len(effects) and not workers.late:
-        current = plainer(problem, current, every, {e.hypothesis.key for e in itself})
+        current = plainer(problem, current, every, {e.hypothesis.key for e in itself}, rounds)
         rounds = renamed(rounds, effects, current.model.effects)
     return beside_its_error(problem, current), rounds
 

@@ -22,6 +22,8 @@ from ident.torque_fit import Fit
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 # velocity over that at which a motor may as well rest, up to which friction may stand for what holds it then
 NEXT_TO_REST = 2.0
+# of what a friction explains of motions, that errors of its law where it turns leave
+TURNS_LEAVE = 1e-3
 
 
 def pruned(problem: Problem, current: Fit) -> Fit:
@@ -102,13 +104,26 @@ def renamed(rounds: Sequence[Round], before: Sequence[Effect], after: Sequence[E
     return [of(r) for r in rounds]
 
 
-def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kept: set[tuple[str, str]]) -> Fit:
+def plainer(
+    problem: Problem,
+    result: Fit,
+    hypotheses: Sequence[Hypothesis],
+    kept: set[tuple[str, str]],
+    rounds: Sequence[Round] = (),
+) -> Fit:
     """The model with the special case in place of effects of which the data do not show what sets them apart from it.
 
     Args:
         kept: keys of effects that stay as they are.
+        rounds: that have named them. Of motions what a friction does where it turns is known to ``TURNS_LEAVE`` of what
+            it explains.
     """
     known = {h.key: h for h in hypotheses}
+    turns = {
+        r.candidates[0].hypothesis.key: TURNS_LEAVE * r.fall
+        for r in rounds
+        if problem.motions_alone and "exceeds" in r.candidates[0].hypothesis.options
+    }
     special_by_itself = partial(plainly_special, problem, result.model)
 
     def plain(effect: Effect) -> Effect:
@@ -128,9 +143,12 @@ def plainer(problem: Problem, result: Fit, hypotheses: Sequence[Hypothesis], kep
     other = polish(problem, replace(result, model=replace(result.model, effects=effects)))
     same = reweighted(problem, result, other.weights)
     scale = max(1.0, same.cost / same.count)
+    allowed = swapped * MIN_EVIDENCE * scale + sum(
+        turns.get(a.hypothesis.key, 0.0) for a, b in zip(result.model.effects, effects, strict=True) if a is not b
+    )
     # One that has reached what makes it its special case is that one, whatever errors of the law make of the rest.
     certain = all(a is b or special_by_itself(a) for a, b in zip(result.model.effects, effects, strict=True))
-    return other if certain or other.cost - same.cost < swapped * MIN_EVIDENCE * scale else result
+    return other if certain or other.cost - same.cost < allowed else result
 
 
 def untold(result: Fit, effect: Effect) -> bool:
@@ -138,8 +156,20 @@ def untold(result: Fit, effect: Effect) -> bool:
     h = effect.hypothesis
     if "apart" not in h.options:
         return False
-    variance = dict(zip(result.names, np.diag(result.covariance()), strict=True))
-    return bool(variance[h.coordinate(h.options["apart"])] >= UNTOLD**2)
+    covariance = result.covariance()
+    at = result.names.index(h.coordinate(h.options["apart"]))
+    return bool(covariance[at, at] >= UNTOLD**2) or level(result, effect, covariance)
+
+
+def level(result: Fit, effect: Effect, covariance: np.ndarray) -> bool:
+    """Whether a parameter of an effect that must be larger than another one is so by chance alone."""
+    h = effect.hypothesis
+    if "exceeds" not in h.options:
+        return False
+    pair = [result.names.index(h.coordinate(name)) for name in h.options["exceeds"]]
+    larger, smaller = (effect.value(name) for name in h.options["exceeds"])
+    off = np.array([1.0, -1.0])
+    return bool(np.log(larger / smaller) < ABSENT * np.sqrt(off @ covariance[np.ix_(pair, pair)] @ off))
 
 
 def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:

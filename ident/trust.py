@@ -19,7 +19,7 @@ from ident.hypotheses import Hypothesis
 from ident.hypotheses.hypothesis import RIPPLE
 from ident.model import Effect
 from ident.problem import NOT_COMPUTED, Problem, data_counts, predictions
-from ident.pruning import UNTOLD
+from ident.pruning import UNTOLD, level
 from ident.quantization import Steps
 from ident.refits import settled
 from ident.rounds import MIN_EVIDENCE, Round
@@ -167,12 +167,8 @@ def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
     """
     h = effect.hypothesis
     at = [final.names.index(h.coordinate(q.name)) for q in h.parameters]
-    if "exceeds" in h.options:
-        pair = [final.names.index(h.coordinate(name)) for name in h.options["exceeds"]]
-        larger, smaller = (effect.value(name) for name in h.options["exceeds"])
-        off = np.array([1.0, -1.0])
-        if np.log(larger / smaller) < CHANCE * np.sqrt(off @ covariance[np.ix_(pair, pair)] @ off):
-            return False
+    if level(final, effect, covariance):
+        return False
     if "shown" in h.options:
         i = final.names.index(h.coordinate(h.options["shown"]))
         return bool(covariance[i, i] < UNTOLD**2)

@@ -159,22 +159,23 @@ def test_friction_that_sticks_is_named(static):
     assert verdict.gain.gap_closed > 0.95
 
 
-def test_where_friction_turns_along_a_motion_looks_like_no_other_cause():
+@pytest.mark.parametrize(("every", "noise"), [(2, NOISE[0]), (4, NOISE[0]), (2, 5.0 * NOISE[0])])
+def test_where_friction_turns_along_a_motion_looks_like_no_other_cause(every, noise):
     """The motor rests for hundredths of a second wherever it turns, far longer than lines of the compared band show."""
     bench, segments = load_robot("twomass"), []
     for i, role in enumerate(("identification", "validation")):
         rng = np.random.default_rng(60 + i)
         t, q, _, _ = through_postures(rng, 1, FS, 30.0)
         reference = 4.0 * q[:, 0]
-        noise = NOISE[0] * rng.normal(size=len(t))
-        tau, q, stuck = run_bench(reference, np.zeros(len(t)), COULOMB, COULOMB, STRIBECK, noise, reference[0])
+        off = noise * rng.normal(size=len(t))
+        tau, q, stuck = run_bench(reference, np.zeros(len(t)), COULOMB, COULOMB, STRIBECK, off, reference[0])
         assert 0.0 < stuck.mean() < 0.2
-        tau, q = (x[::2, None] for x in (tau + 1e-3 * rng.normal(size=len(t)), q))
-        segments.append(Segment(name=f"m{i}", role=role, kind="trajectory", t=t[::2], tau=tau, q=q))
+        tau, q = (x[::every, None] for x in (tau + 1e-3 * rng.normal(size=len(t)), q))
+        segments.append(Segment(name=f"m{i}", role=role, kind="trajectory", t=t[::every], tau=tau, q=q))
     data = Dataset(
         name="turns",
         robot=bench,
-        sample_rate=FS / 2,
+        sample_rate=FS / every,
         joints=bench.joint_names,
         input_hold="none",
         q_std=None,
