@@ -155,6 +155,8 @@ def attribute(
         rounds.append(found)
         count += 1
         nameless = best.hypothesis.decoy and not best.hypothesis.options.get("of_record")
+        # Beside causes of single joints of a motion it is another one: they are trusted by what is left where they sit.
+        nameless = nameless and not (by_joint and named)
         unknown = unknown or (nameless and left_share(baseline, current) > LEFT_TO_DECOYS)
         if best.hypothesis.decoy and not best.hypothesis.options.get("baseline"):
             if not by_joint or best.hypothesis.on_chain:

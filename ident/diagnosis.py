@@ -321,7 +321,7 @@ def with_inertias(
         return setup, result, None
     other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
     left = left_over(other.final, result.final)
-    if left > 1.0 or not worth_it(left, foretold(setup, result.final, other.final, workers)):
+    if not worth_it(left, foretold(setup, result.final, other.final, workers)):
         return setup, result, None
     return replace(setup, problem=problem), other, rigid
 
@@ -343,11 +343,11 @@ def worth_it(left: float, left_out: tuple[float, float]) -> bool:
 
     Args:
         left: of the motions that were fitted (``left_over``). Both sides have causes of their own, sought apart, which
-            makes this rough.
+            makes this rough: it counts where it is much, and parts left out where it is not.
         left_out: interval of the same on parts of them that were not (``foretold``).
     """
     least, most = left_out
-    return least <= 1.0 and (left <= SETTLED_BY_INERTIAS or (left <= 1.0 and most < 1.0))
+    return least <= 1.0 and (left <= SETTLED_BY_INERTIAS or most < 1.0)
 
 
 def foretold(setup: Setup, one: Fit, other: Fit, workers: Workers) -> tuple[float, float]:
