@@ -27,7 +27,7 @@ from ident.identification import (
     under_noise_beside_causes,
     with_noise_of_fast_lines,
 )
-from ident.left_out import errors_on_parts, joined, refitted
+from ident.left_out import SEED, errors_on_parts, joined, refitted
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
 from ident.next_experiment import separating_experiment
@@ -53,7 +53,6 @@ CARRIED_OVER = 0.9
 LEFT_TO_LINKS = 1e-3  # share of the discrepancy up to which errors of the laws of causes, not links, are what is left
 TOWARDS = 0.68  # level of the interval that says so: neither choice is the safe one
 MAX_SECONDS = 600.0  # of search for causes
-SEED = 0
 
 
 def diagnose(

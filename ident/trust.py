@@ -161,8 +161,8 @@ def denied(problem: Problem, groups: Sequence[Group], found: Round) -> bool:
 def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
     """Whether the data tell the size of what makes an effect the one that it is named, to about a factor of ``e``.
 
-    One that makes it by exceeding another must do so beyond chance. Where each parameter has a value at which the effect is none, all of them together must be further from there than
-    chance brings them (Wald 1943): a cause that has explained much while others were missing may be nothing beside
+    One that makes it by exceeding another must do so beyond chance. Where each parameter has a value at which the
+    effect is none, all of them together must be further from there than chance brings them (Wald 1943): a cause that has explained much while others were missing may be nothing beside
     these.
     """
     h = effect.hypothesis

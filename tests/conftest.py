@@ -7,6 +7,7 @@ import pytest
 import tomlkit
 from threadpoolctl import threadpool_limits
 
+from ident.dataset import Dataset
 from ident.dataset_io import load_dataset, save_dataset
 from ident.excitation import operating_points
 from ident.identification import identify
@@ -50,6 +51,21 @@ def through_postures(rng, n, rate, seconds):
     q = np.sin(arg) @ a + np.cos(arg) @ b + rng.uniform(-0.5, 0.5, n)
     v = (np.cos(arg) * w) @ a - (np.sin(arg) * w) @ b
     return t, q, v, -(np.sin(arg) * w**2) @ a - (np.cos(arg) * w**2) @ b
+
+
+def of_motions(robot, rate, segments, **given):
+    """A dataset of motions of a robot alone, sampled at ``rate`` Hz; noise as given, else as its records show it."""
+    noise = {"q_std": None, "tau_std": None} | {key: np.full(robot.n, std) for key, std in given.items()}
+    return Dataset(
+        name="motions",
+        robot=robot,
+        sample_rate=rate,
+        joints=robot.joint_names,
+        input_hold="none",
+        controller=None,
+        segments=tuple(segments),
+        **noise,
+    )
 
 
 def over_steps(torque, x, parts=1000):

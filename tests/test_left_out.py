@@ -8,7 +8,7 @@ import pytest
 
 from ident.attribute import attribute
 from ident.chain import build_structure
-from ident.dataset import Dataset, Segment
+from ident.dataset import Segment
 from ident.hypotheses import catalogue
 from ident.identification import identify
 from ident.left_out import carries_over
@@ -16,7 +16,7 @@ from ident.model import Effect
 from ident.parallel import Workers
 from ident.refits import beside_its_error, polish
 from robot_assets.robot import load_robot
-from tests.conftest import through_postures
+from tests.conftest import of_motions, through_postures
 
 pytestmark = pytest.mark.xdist_group("left_out")  # one worker makes what they share
 
@@ -45,17 +45,7 @@ def recorded(robot, torques, scale=1.0):
         tau[:, 0] += wandering(rng, t)
         tau += 0.01 * rng.normal(size=tau.shape)
         segments.append(Segment(name=f"m{i}", role=role, kind="trajectory", t=t, tau=tau, q=q))
-    data = Dataset(
-        name="wandered",
-        robot=robot,
-        sample_rate=RATE,
-        joints=robot.joint_names,
-        input_hold="none",
-        q_std=np.full(robot.n, 1e-7),
-        tau_std=np.full(robot.n, 0.01),
-        controller=None,
-        segments=tuple(segments),
-    )
+    data = of_motions(robot, RATE, segments, q_std=1e-7, tau_std=0.01)
     setup, first = identify(data)
     return setup.problem, first
 

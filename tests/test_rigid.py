@@ -33,7 +33,7 @@ from ident.trust import too_fast
 from robot_assets.robot import Elasticity, load_robot
 from sim import parse_effect
 from sim.experiment import draw_drives
-from tests.conftest import quick_experiment, small_plan, through_files, through_postures
+from tests.conftest import of_motions, quick_experiment, small_plan, through_files, through_postures
 
 pytestmark = pytest.mark.xdist_group("rigid")  # one worker makes what they share
 
@@ -57,17 +57,7 @@ def rigid_motion(robot, seed, seconds=20.0):
 
 
 def dataset_of(robot, *segments):
-    return Dataset(
-        name="motions",
-        robot=robot,
-        sample_rate=RATE,
-        joints=robot.joint_names,
-        input_hold="none",
-        q_std=np.full(robot.n, 1e-7),
-        tau_std=np.full(robot.n, 0.02),
-        controller=None,
-        segments=segments,
-    )
+    return of_motions(robot, RATE, segments, q_std=1e-7, tau_std=0.02)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from ident.refits import either_turn, refit
 from ident.stiction import LEFT_HELD, as_held, held, held_share
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
-from tests.conftest import through_postures
+from tests.conftest import of_motions, through_postures
 
 FS, PERIOD, PERIODS, STEPS = 1000.0, 2000, 3, 16
 MOTOR, LOAD, SPRING, DAMPER, VISCOUS = 0.004, 0.00477, 380.0, 0.03, 0.02
@@ -172,18 +172,7 @@ def test_where_friction_turns_along_a_motion_looks_like_no_other_cause(every, no
         assert 0.0 < stuck.mean() < 0.2
         tau, q = (x[::every, None] for x in (tau + 1e-3 * rng.normal(size=len(t)), q))
         segments.append(Segment(name=f"m{i}", role=role, kind="trajectory", t=t[::every], tau=tau, q=q))
-    data = Dataset(
-        name="turns",
-        robot=bench,
-        sample_rate=FS / every,
-        joints=bench.joint_names,
-        input_hold="none",
-        q_std=None,
-        tau_std=None,
-        controller=None,
-        segments=tuple(segments),
-    )
-    verdict = diagnose(data)
+    verdict = diagnose(of_motions(bench, FS / every, segments))
     (cause,) = [c for c in verdict.causes if c.probability > 0.5]
     assert cause.effect == "coulomb_friction" and cause.probability > 0.9
     assert cause.parameters["torque"].value == pytest.approx(COULOMB, rel=0.02)
