@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.attribute import as_loops, from_other_motions
 from ident.coordinates import pack, unpack
 from ident.costs import joint_costs
 from ident.derivatives import jacobian
 from ident.extended import predict
+from ident.follow_up import as_loops, from_other_motions
 from ident.hypotheses import catalogue, kernels
 from ident.hypotheses.yielding import elastoplastic
 from ident.identification import set_up
@@ -194,8 +194,8 @@ def test_a_law_is_begun_from_other_sizes_where_it_leaves_more_than_noise(identif
         tried.append(model.effects[0].p)
         return replace(result, model=model, costs=result.counts * (1.2 if model.effects[0].p[1] > 1e-4 else 1.0))
 
-    monkeypatch.setattr("ident.attribute.refit", fitted)
-    monkeypatch.setattr("ident.attribute.polish", lambda problem, found: found)
+    monkeypatch.setattr("ident.follow_up.refit", fitted)
+    monkeypatch.setattr("ident.follow_up.polish", lambda problem, found: found)
     quiet, loud = (replace(result, model=model, costs=x * result.counts) for x in (1.05, 1.5))
     assert from_other_motions(problem, quiet, Workers()) is quiet and not tried
     found = from_other_motions(problem, loud, Workers())

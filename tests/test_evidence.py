@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, companions, less_errors_of_laws
+from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, less_errors_of_laws
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
 from ident.conclude import _cause, _drifting_friction, conclude, faint_note, held_out_note
@@ -30,6 +30,7 @@ from ident.evidence import (
     pointless,
     weigh,
 )
+from ident.follow_up import companions
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
 from ident.hypotheses.bodies import LOAD_NATS, link_inertia, payload, payload_like
@@ -1492,6 +1493,9 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
     scores = [Score(h, 1.0, 1, np.array([1e-4, 0.0]), np.ones(1), ()) for h in (other, backlash)]
     monkeypatch.setattr("ident.strong.strong_effects", lambda *args: scores)
     monkeypatch.setattr("ident.strong.anneal", annealed)
+    monkeypatch.setattr("ident.strong.without_strong", lambda *args: ())
+    monkeypatch.setattr("ident.strong.recovered", lambda problem, result: result)
+    monkeypatch.setattr("ident.strong.either_turn", lambda problem, result, effect: result)
     monkeypatch.setattr("ident.strong.simulated", lambda problem, h, result: (h, result))
     monkeypatch.setattr("ident.strong.under_own_noise", lambda problem, result: None)
     monkeypatch.setattr("ident.strong.implausible", lambda *args: False)
