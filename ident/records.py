@@ -29,7 +29,8 @@ CREEP = 6.0  # standard deviations of their noise, by which both must differ
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
-MOTION_BAND = 1.5  # the same of motions
+# the same of motions: the taper at their ends mixes lines that lie half of their compared band apart and more
+MOTION_BAND = 2.0
 # of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
 FAST_BAND = 6.0
 
@@ -103,12 +104,12 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
     fs, N = dataset.sample_rate, int(first.period)
     top = min(int(np.floor(band_hz * N / fs + 1e-9)), N // 2 - 1)
     n_lines = min(int(np.ceil(SIGNAL_BAND * top)) + 2, N // 2)
-    q = [without_creep(s.periodic("q")) for s in members]
-    U_p = np.stack([_lines(without_creep(s.periodic("tau")), n_lines) for s in members])
+    q = [_steady(s, "q") for s in members]
+    U_p = np.stack([_lines(_steady(s, "tau"), n_lines) for s in members])
     Q_p = np.stack([_lines(x, n_lines) for x in q])
     link = None
     if all(s.q_link is not None for s in members):
-        link = np.stack([_lines(without_creep(s.periodic("q_link")), n_lines).mean(axis=0) for s in members])
+        link = np.stack([_lines(_steady(s, "q_link"), n_lines).mean(axis=0) for s in members])
     excited = np.zeros((len(members), n_lines), bool)
     for i, s in enumerate(members):
         lines = np.asarray(s.excited_lines, int)
@@ -151,19 +152,34 @@ def _middle_periods(members: list[Segment]) -> np.ndarray:
     return np.array([s.transient_periods + 0.5 * (s.steady_periods - 1) for s in members])
 
 
-def without_creep(x: np.ndarray) -> np.ndarray:
+def _steady(segment: Segment, channel: str) -> np.ndarray:
+    """Steady periods (P, N, n) of a channel, less what they creep by."""
+    N = int(segment.period)
+    samples = getattr(segment, channel)[: segment.transient_periods * N]
+    return without_creep(segment.periodic(channel), samples[-N:] if len(samples) >= N else None)
+
+
+def without_creep(x: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """Periods (P, N, n) less the line that leads from where they begin to where they end, where that is elsewhere.
 
     What ends elsewhere than it began, as a motor that sticks and creeps does, has lines of its jump. A steady velocity
     is a motion of the arm too: less that, what is left repeats.
+
+    Args:
+        before: (N, n) the period before, of a transient, by whose end a single one is told where it begins; or None.
     """
     P, N, _ = x.shape
-    if P < 2:
+    if P < 2 and before is None:
         return x
     width = min(BORDER_SAMPLES, N)
-    # From the start of the first period to that of the second, and from the end of the first to that of the last.
-    jump = (x[1] - x[0])[:width].mean(axis=0) + (x[-1] - x[0])[-width:].mean(axis=0)
-    noise = np.maximum(2.0 * difference_noise(x.reshape(P * N, -1)) / np.sqrt(width), _change(x[-1] - x[0], width))
+    if P < 2:
+        change = (x[0] - before)[N // 2 :]
+        jump = change[-width:].mean(axis=0)
+    else:
+        # From the start of the first period to that of the second, and from the end of the first to that of the last.
+        change = x[-1] - x[0]
+        jump = (x[1] - x[0])[:width].mean(axis=0) + change[-width:].mean(axis=0)
+    noise = np.maximum(2.0 * difference_noise(x.reshape(P * N, -1)) / np.sqrt(width), _change(change, width))
     at = np.arange(P * N).reshape(P, N, 1) - 0.5 * (P * N - 1)
     return x - at * np.where(np.abs(jump) > CREEP * noise, jump, 0.0) / (P * N)
 

@@ -15,10 +15,11 @@ from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.law_noise import law_noise
 from ident.model import Effect, Model
-from ident.problem import data_count
+from ident.problem import data_count, residual
 from ident.records import build_groups
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
+from tests.conftest import of_motions
 
 RATE = 500.0
 
@@ -42,6 +43,34 @@ def test_the_return_of_a_motion_goes_on_with_its_acceleration(noise):
         assert np.all(step < 0.2 * top + 4 * noise * RATE**2)
         assert np.all(np.abs(v[at + 1] - v[at - 2]) < 3.6 / RATE * top + 4 * noise * RATE)
     assert np.abs(whole[4000:]).max() < 4.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_motion_that_breaks_off_leaves_nothing_of_its_ends(seed):
+    """Sines of a linear drive, begun and ended under way, against its impedance: the line of a few ten thousandths of
+    the torque to which real motions show it must be far above what the ends leave."""
+    bench, rng = load_robot("twomass"), np.random.default_rng(seed)
+    t = np.arange(3000) / RATE
+    hz = rng.uniform(0.2, 1.4, 6)
+    size = rng.normal(size=6) / (1.0 + hz) * np.exp(2j * np.pi * rng.random(6))
+    waves = np.exp(2j * np.pi * np.outer(t, hz))
+
+    def recorded(lines):
+        q, tau = ((waves @ x).real[:, None] for x in (size, lines))
+        return of_motions(bench, RATE, [Segment(name="m", role="identification", kind="trajectory", t=t, tau=tau, q=q)])
+
+    still = recorded(0.0 * size)
+    problem = set_up(still).problem
+    model = Model(problem.structure, problem.nominal)
+    pred = predict(model, build_groups(still, motion_band_hz=3.0)[0], problem.sampling)
+    seen = pred.sampled_impedance[:, 0, 0]
+    lines = pred.plane.s.imag / (2 * np.pi)
+    # A polynomial between its lines, exact far below the mode of the load.
+    near = lines < 4.0
+    impedance = [np.polyval(np.polyfit(lines[near], part[near], 8), hz) for part in (seen.real, seen.imag)]
+    (group,) = build_groups(recorded((impedance[0] + 1j * impedance[1]) * size), motion_band_hz=3.0)
+    error = residual(group, predict(model, group, problem.sampling))
+    assert np.linalg.norm(error) < 3e-5 * np.linalg.norm(group.observe(group.U))
 
 
 @pytest.mark.parametrize("seconds", [4.0, 15.0])

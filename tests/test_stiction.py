@@ -229,6 +229,25 @@ def test_a_motor_that_creeps_is_periodic_but_for_a_line(creep):
     assert (y - y[:1]).mean(axis=(1, 2)) == pytest.approx(np.zeros(P), abs=0.01 * 3e-4)
 
 
+@pytest.mark.parametrize("slow", [0.0, 2e-3])
+def test_a_single_period_whose_transient_goes_on_slowly_is_periodic_but_for_a_line(slow):
+    """The integrator of a loop takes longer than the transient: by the end of the period before, its jump is told."""
+    rng, N = np.random.default_rng(6), 4000
+    t = np.arange(2 * N) / N
+    swing = 1e-3 * np.sin(2 * np.pi * 3 * t)
+    ringing = 1e-2 * np.exp(-t / 0.03) * np.cos(2 * np.pi * 40 * t)
+    x = (swing + ringing + slow * np.exp(-t / 1.1) + 1e-6 * rng.normal(size=2 * N)).reshape(2, N, 1)
+    y = without_creep(x[1:], x[0])
+    assert np.array_equal(without_creep(x[1:]), x[1:])
+    if not slow:
+        assert np.array_equal(y, x[1:])
+    left = np.fft.rfft(y[0, :, 0] - swing[N:])[1:300] / N
+    jump = slow * (np.exp(-1 / 1.1) - np.exp(-2 / 1.1))
+    # Lines of a jump, and of what bends less than a tenth of that.
+    lines = jump / (2 * np.pi * np.arange(1, 300))
+    assert np.all(np.abs(left) < 0.15 * lines + 1e-7)
+
+
 def test_a_drive_that_hunts_between_steps_of_its_encoder_does_not_creep():
     """Pulses here and there, of which some fall on the ends of the periods: most differences of samples are small."""
     rng, P, N = np.random.default_rng(2), 3, 4000
