@@ -70,7 +70,7 @@ def test_a_motion_that_breaks_off_leaves_nothing_of_its_ends(seed):
     impedance = [np.polyval(np.polyfit(lines[near], part[near], 8), hz) for part in (seen.real, seen.imag)]
     (group,) = build_groups(recorded((impedance[0] + 1j * impedance[1]) * size), motion_band_hz=3.0)
     error = residual(group, predict(model, group, problem.sampling))
-    assert np.linalg.norm(error) < 3e-5 * np.linalg.norm(group.observe(group.U))
+    assert np.linalg.norm(error) < 5e-5 * np.linalg.norm(group.observe(group.U))
 
 
 @pytest.mark.parametrize("seconds", [4.0, 15.0])
