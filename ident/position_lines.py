@@ -31,8 +31,12 @@ def wave_numbers(problem: Problem, predictions: Sequence[Prediction], joint: int
     repeat a whole number of times in its turn.
     """
     ratio = problem.structure.robot.joints[joint].gear_ratio
-    orders = tuple(order * ratio for order in MOTOR_ORDERS) if ratio > 1.0 else ()
-    return (*position_lines(problem, predictions, joint), *orders)
+    return (*position_lines(problem, predictions, joint), *motor_orders(ratio))
+
+
+def motor_orders(gear_ratio: float) -> tuple[float, ...]:
+    """Wave numbers (1/rad of the joint) of parts that turn with its motor; none of a joint without a gear."""
+    return tuple(order * gear_ratio for order in MOTOR_ORDERS) if gear_ratio > 1.0 else ()
 
 
 def position_lines(

@@ -18,14 +18,15 @@ from ident.extended import Prediction, predict
 from ident.hypotheses import Hypothesis, SignalScale
 from ident.motion import Motion
 from ident.parallel import map_threads, one_thread_each
-from ident.position_lines import wave_numbers
+from ident.position_lines import motor_orders, wave_numbers
 from ident.posture import moved_by_gears
 from ident.problem import Problem, output_error
 from ident.torque_fit import RIDGE, Fit
 from ident.torque_fit import inverse as steadied_inverse
 
-MOST_WAVES = 2  # of a ripple, beside the best
+MOST_WAVES = 2  # of a ripple, beside the best, of those found and of those that motors have
 NEAR_WAVE = 0.9  # of the gain of the best
+NEAR_ORDER = 0.5  # the same of a wave that a motor has: several of any length fit a few postures by chance
 SAME_WAVE = 0.02  # relative, of two
 SHIFT = 1e-4  # rad or m, of a position along which a motion is predicted once more
 
@@ -207,21 +208,29 @@ def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequen
             # A resonance that is taken away says nothing of one that is missing elsewhere.
             hinge = "hinge" in h.options
             first, *others = sorted(scores, key=lambda s: (hinge and s.start is None, -s.gain))
-            best.append(replace(first, near=other_waves(first, others)) if h.repeats else first)
+            ratio = stage.problem.structure.robot.joints[h.joint].gear_ratio
+            best.append(replace(first, near=other_waves(first, others, motor_orders(ratio))) if h.repeats else first)
     return best
 
 
-def other_waves(best: Score, others: Sequence[Score]) -> tuple[Score, ...]:
-    """Scores of a ripple, best first, at wave numbers that none before has, and that come near the best."""
-    kept = [best]
+def other_waves(best: Score, others: Sequence[Score], orders: Sequence[float] = ()) -> tuple[Score, ...]:
+    """Scores of a ripple, best first, at wave numbers that none before has, and that come near the best.
+
+    Args:
+        orders: wave numbers that parts of the motor have.
+    """
+    kept, left = [best], {True: MOST_WAVES, False: MOST_WAVES}
     for s in others:
+        of_motor = s.shape[0] in orders
         if (
             s.start is not None
-            and s.gain >= NEAR_WAVE * best.gain
+            and left[of_motor]
+            and s.gain >= (NEAR_ORDER if of_motor else NEAR_WAVE) * best.gain
             and all(abs(s.shape[0] / k.shape[0] - 1.0) > SAME_WAVE for k in kept)
         ):
             kept.append(s)
-    return tuple(kept[1 : 1 + MOST_WAVES])
+            left[of_motor] -= 1
+    return tuple(kept[1:])
 
 
 def _score(stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, shape: tuple[float, ...]) -> Score | None:

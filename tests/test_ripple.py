@@ -103,6 +103,9 @@ def test_other_wave_numbers_that_explain_nearly_as_much_are_kept(identified):
     unstarted, third, fourth = score(150.0, 99.0, None), score(400.0, 91.0), score(800.0, 90.5)
     assert other_waves(best, [unstarted, near, nearer, third, fourth, far]) == (near, third)
     assert other_waves(best, [far, score(302.0, 99.0)]) == ()
+    # Of a motor with a gear of 50, by less.
+    assert other_waves(best, [near, third, fourth, far], (50.0, 100.0, 800.0)) == (near, third, fourth, far)
+    assert other_waves(best, [score(50.0, 40.0)], (50.0,)) == ()
 
 
 @pytest.mark.parametrize("name", ["cogging", pytest.param("transmission_error", marks=pytest.mark.slow)])
