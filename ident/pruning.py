@@ -14,7 +14,7 @@ from ident.group import Group
 from ident.hypotheses import Hypothesis
 from ident.model import Effect, Model, joints_along_record
 from ident.parallel import Workers
-from ident.problem import Problem
+from ident.problem import Problem, predictions
 from ident.refits import POLISH_STEPS, clip_to_bounds, polish, refit, reweighted
 from ident.rounds import MIN_EVIDENCE, Round
 from ident.torque_fit import Fit
@@ -49,13 +49,32 @@ def pruned(problem: Problem, current: Fit) -> Fit:
         ]
         return all(sizes) if sizes else all(x < ABSENT for x in off)
 
-    effects = current.model.effects
-    needed = tuple(e for e in effects if e.hypothesis.options.get("baseline") or not nothing(e))
+    effects, par, lines = current.model.effects, current.model.par, gears_of_one_slope(problem, current)
+    needed = tuple(
+        e for e in effects if e.hypothesis.key not in lines and (e.hypothesis.options.get("baseline") or not nothing(e))
+    )
     if len(needed) == len(effects):
         return current
-    other = polish(problem, replace(current, model=replace(current.model, effects=needed)))
+    stiffness = par.stiffness.copy()
+    for j, slope in lines.values():
+        stiffness[j] = slope
+    model = replace(current.model, par=replace(par, stiffness=stiffness), effects=needed)
+    other = polish(problem, replace(current, model=model))
     same = reweighted(problem, current, other.weights)
     return other if other.cost - same.cost < MIN_EVIDENCE * max(1.0, same.cost / same.count) else current
+
+
+def gears_of_one_slope(problem: Problem, current: Fit) -> dict[tuple[str, str], tuple[int, float]]:
+    """Keys of laws of gears with a middle that no record leaves, and joint and slope there, N m/rad: a spring like any
+    other, of which the drives had missed the stiffness."""
+    softer = [e for e in current.model.effects if "middle" in e.hypothesis.options]
+    preds = predictions(problem, current.model, current.remainders) if softer else []
+    out = {}
+    for e in softer:
+        half, slope = e.hypothesis.options["middle"](e.p)
+        if all(np.abs(pred.motion().delta(e.hypothesis.joint)).max() < half for pred in preds):
+            out[e.hypothesis.key] = e.hypothesis.joint, slope
+    return out
 
 
 def without_shadows(problem: Problem, current: Fit, rounds: Sequence[Round], workers: Workers) -> Fit:

@@ -125,6 +125,7 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         options={
             "size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms]),
             "trivial": lambda p, k: p[0] <= 1.02 * SOFTEST * k,
+            "middle": lambda p: (p[1], p[0]),  # rad to either side, and the slope there
             "bends": resized,
         },
     )
