@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, HOPELESS, discrepancy_p_value, implausible, loud
+from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS, discrepancy_p_value, implausible, loud
 from ident.contests import weighed_again
 from ident.faint import SEEN, hidden
 from ident.follow_up import as_loops, companions, from_other_motions
@@ -26,7 +26,6 @@ from ident.parallel import Workers
 from ident.problem import Problem
 from ident.pruning import plainer, plainly_special, pruned, renamed, untold, without_shadows
 from ident.refits import (
-    FAINT,
     beside_its_error,
     polish,
     reweighted,

@@ -15,6 +15,7 @@ from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
 
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom up to which the estimate of the noise may be short of it
+FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched from linear steps that keep the data
 JOINT_EXCESS = 1.25  # the same of a single joint
 JOINT_CHANCE = 4.0  # standard deviations of that by chance, which few data leave
 ERROR_OF_LAWS = 0.01  # of what causes explain at a joint, left there by errors of their laws

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-from ident.baseline import DETECTION_EXCESS
+from ident.baseline import DETECTION_EXCESS, FAINT
 from ident.evidence import Candidate, errors_by_joint, weigh
 from ident.hypotheses import Hypothesis, catalogue
 from ident.hypotheses.bodies import payload, payload_like
@@ -15,7 +15,6 @@ from ident.parallel import Workers
 from ident.problem import Problem, predictions
 from ident.pruning import pruned, untold
 from ident.refits import (
-    FAINT,
     FINALISTS,
     FIRST_STEPS,
     POLISH_STEPS,

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.attribute import Attribution, attribute
-from ident.baseline import fit_baseline
+from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed
 from ident.conclude import conclude, named_effects, roll_off_note
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
@@ -36,6 +36,7 @@ from ident.period_checks import unrepeated
 from ident.problem import NOT_COMPUTED, predictions
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, carried_over, fit_rigid
+from ident.swings import swings, without_swings
 from ident.tones import Tone, find_tones
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit
@@ -235,7 +236,14 @@ def sought(
     dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
 ) -> tuple[Setup, Fit, Attribution]:
     """Causes of what the baseline leaves; once more where beside these the noise turns out to be far more or far less
-    than was guessed."""
+    than was guessed, or that the arm still swung."""
+    return beside_steady_records(*under_noise_seen(dataset, setup, baseline, max_causes, workers), max_causes, workers)
+
+
+def under_noise_seen(
+    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
+) -> tuple[Setup, Fit, Attribution]:
+    """Causes of what the baseline leaves, under the noise that is seen beside them."""
     result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
     try:
         louder = with_noise_of_fast_lines(dataset, setup.problem, result.final)
@@ -250,6 +258,25 @@ def sought(
         return setup, baseline, result
     workers.say("less noise")
     return other, first, attribute(other.problem, first, max_causes=max_causes, known=result, workers=workers)
+
+
+def beside_steady_records(
+    setup: Setup, baseline: Fit, result: Attribution, max_causes: int, workers: Workers
+) -> tuple[Setup, Fit, Attribution]:
+    """Causes beside records less what the arm swings by itself, where those found by then show it and the baseline was
+    too far from the data for that."""
+    final = result.final
+    shown = bool(result.rounds) and final.chi2_per_dof > DETECTION_EXCESS and not swings(setup.problem, baseline)
+    if not shown or workers.late or not swings(setup.problem, final):
+        return setup, baseline, result
+    workers.say("records less what swings")
+    try:
+        problem = without_swings(setup.problem, final)
+        first = renewed(problem, baseline)
+    except NOT_COMPUTED:
+        return setup, baseline, result
+    again = attribute(problem, first, max_causes=max_causes, known=result, workers=workers)
+    return replace(setup, problem=problem), first, again
 
 
 def unresolved(result: Attribution) -> bool:

@@ -48,6 +48,7 @@ class Group:
             of which they are measured; or None.
         rounding: (K, n) variance of a line of the mean position by the steps of its encoder, rad2, which repeats with
             the motion and does not average out over periods; or None.
+        creeps: whether single periods end elsewhere than the one before, of a transient.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -80,6 +81,7 @@ class Group:
     Q_noise: np.ndarray | None = None
     known_noise: tuple[np.ndarray, np.ndarray] | None = None
     rounding: np.ndarray | None = None
+    creeps: bool = False
 
     @property
     def shows_noise(self) -> bool:

@@ -30,9 +30,9 @@ from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps, with_rounding
 from ident.recorded_noise import declared_position_noise, given_noise, least_noise, noise_of, recorded_noise
 from ident.records import build_groups
-from ident.refits import FAINT, under_own_noise
+from ident.refits import under_own_noise
 from ident.roll_off import with_roll_off
-from ident.swings import without_swings
+from ident.swings import swings, without_swings
 from ident.torque_fit import Fit
 from robot_assets.errors import DataError
 
@@ -150,9 +150,7 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
         ) from err
     as_recorded = setup.problem
     for _ in range(RENEWALS):
-        # What is missing in a model that is far from the data would be taken off with what swings, as far as a few
-        # numbers can do it.
-        if result.chi2_per_dof > FAINT or not np.any(drifting(setup.problem.groups)):
+        if not swings(setup.problem, result):
             break
         setup = replace(setup, problem=without_swings(as_recorded, result))
         result = renewed(setup.problem, result, progress)

@@ -30,7 +30,7 @@ MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for th
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
 # the same of motions: the taper at their ends mixes lines that lie half of their compared band apart and more
-MOTION_BAND = 1.75
+MOTION_BAND = 2.1
 # of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
 FAST_BAND = 6.0
 
@@ -143,6 +143,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
         noise_spacing=spacing,
         U_noise=noise[0],
         Q_noise=noise[1],
+        creeps=any(len(x) == 1 and np.any(x != s.periodic("q")) for x, s in zip(q, members, strict=True)),
     )
     return replace(group, rest=group.rest | turning(group))
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS
+from ident.baseline import DETECTION_EXCESS, FAINT
 from ident.costs import fair_costs
 from ident.hypotheses import Hypothesis
 from ident.hypotheses.friction import SMOOTHING, other_turn
@@ -18,7 +18,6 @@ from ident.screening import Score
 from ident.torque_fit import Fit, fit
 from ident.weights import make_weights, with_model_error
 
-FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched from linear steps that keep the data
 FINALISTS = 3  # candidates that are fitted to the end
 FIRST_STEPS = 4  # steps after which candidates are compared for the first time
 RECORD_EXCESS = 1.6  # chi2 per degree of freedom up to which a model along the record leaves no more than noise

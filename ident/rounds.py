@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, implausible
+from ident.baseline import DETECTION_EXCESS, FAINT, implausible
 from ident.evidence import (
     LAW_ERROR,
     TEMPER,
@@ -21,7 +21,7 @@ from ident.evidence import (
 from ident.hypotheses import Hypothesis
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
-from ident.refits import FAINT, FINALISTS, left_by, refit, reweighted, settled, under_own_noise
+from ident.refits import FINALISTS, left_by, refit, reweighted, settled, under_own_noise
 from ident.screening import Score, screen
 from ident.search import MIN_SHARE, STRONG, best_named, explore, explore_softly, under_noise_of_best
 from ident.strong import beside_strong

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, HOPELESS
+from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS
 from ident.coordinates import stepped
 from ident.costs import weighted_cost
 from ident.evidence import explained, last_is_pointless
@@ -23,7 +23,6 @@ from ident.model import Model, has_loop, is_along_record
 from ident.parallel import Workers
 from ident.problem import NOT_COMPUTED, Problem, Weights, predictions
 from ident.refits import (
-    FAINT,
     FINALISTS,
     FIRST_STEPS,
     either_turn,

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.baseline import DETECTION_EXCESS, FAINT
 from ident.extended import Prediction
 from ident.group import Group
-from ident.noise import white_covariance
+from ident.noise import drifting, white_covariance
 from ident.problem import Problem, predictions
 from ident.torque_fit import Fit
 
@@ -30,6 +31,19 @@ def without_swings(problem: Problem, result: Fit) -> Problem:
         _steadied(problem, g, p) if g.window is None else g for g, p in zip(problem.groups, preds, strict=True)
     )
     return replace(problem, groups=groups)
+
+
+def swings(problem: Problem, result: Fit) -> bool:
+    """Whether records are to be taken without what swings: where periods drift, or where a single one ends elsewhere
+    than it began and more than noise is left, of which not too much.
+
+    What is missing in a model that is far from the data would be taken off with what swings, as far as a few numbers
+    can do it.
+    """
+    if result.chi2_per_dof > FAINT:
+        return False
+    creeps = result.chi2_per_dof > DETECTION_EXCESS and any(g.creeps for g in problem.groups)
+    return creeps or bool(np.any(drifting(problem.groups)))
 
 
 def by_ends(pred: Prediction, lines: np.ndarray) -> np.ndarray:

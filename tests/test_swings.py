@@ -50,7 +50,8 @@ def test_a_link_that_goes_on_swinging_is_no_noise():
 def test_nothing_is_taken_off_where_a_model_is_far_from_the_data(clean, monkeypatch, scale):
     """A part of what is missing would go with it."""
     asked = []
-    monkeypatch.setattr("ident.identification.drifting", lambda groups: np.ones(6, bool))
+    for module in ("identification", "swings"):
+        monkeypatch.setattr(f"ident.{module}.drifting", lambda groups: np.ones(6, bool))
     monkeypatch.setattr("ident.identification.without_swings", lambda problem, result: asked.append(result) or problem)
     wrong = np.where(np.arange(6) == 1, scale, 1.0)
     data = replace(clean[0], segments=tuple(replace(s, tau=s.tau * wrong) for s in clean[0].segments))
