@@ -62,7 +62,9 @@ def true_hypothesis(problem: Problem, effect) -> Effect:
         ]
     if not fits:
         raise LookupError("no hypothesis of the torque equation")
-    values = [float(truth.get(p.name, START.get(p.name, 1.0))) for p in fits[0].parameters]
+    values = [
+        float(truth.get(p.name, START.get(p.name, 1.0 if p.null is None else p.null))) for p in fits[0].parameters
+    ]
     return Effect(fits[0], np.array(values))
 
 

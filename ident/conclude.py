@@ -10,7 +10,7 @@ from ident.attribute import DETECTION_LEVEL, Attribution
 from ident.baseline import DETECTION_EXCESS, UNDETERMINED
 from ident.chain import INERTIAL, Structure
 from ident.dataset import Dataset
-from ident.evidence import Candidate, pointless
+from ident.evidence import ABSENT, Candidate, pointless
 from ident.extended import Prediction
 from ident.hypotheses import Hypothesis
 from ident.hypotheses.hypothesis import RIPPLE
@@ -400,7 +400,8 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
         i = index[h.coordinate(q.name)]
         s = float(np.sqrt(max(covariance[i, i], 0.0)))
         std[q.name] = s * abs(v) if q.log else s
-        if q.reported or not q.nuisance:
+        found = q.null is not None and not q.at_start and abs(v - q.null) > ABSENT * std[q.name]
+        if q.reported or not q.nuisance or found:
             out[q.name] = Value(float(v), std[q.name], unit_at(q.unit, linear))
     if "sine" in out:
         a, b = out.pop("sine"), out.pop("cosine")

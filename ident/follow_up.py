@@ -13,6 +13,7 @@ import numpy as np
 from ident.baseline import DETECTION_EXCESS
 from ident.evidence import Candidate, last_is_pointless
 from ident.hypotheses import Hypothesis
+from ident.hypotheses.friction import bristled_stribeck
 from ident.model import Effect, is_along_record
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
@@ -28,7 +29,7 @@ from ident.refits import (
     reweighted,
 )
 from ident.rounds import MIN_EVIDENCE, Round
-from ident.screening import screen
+from ident.screening import screen, signal_scale
 from ident.search import MIN_SHARE
 from ident.strong import simulated
 from ident.torque_fit import Fit
@@ -70,6 +71,9 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
         turned = either_turn(problem, current, effect)
         if turned.cost < current.cost - MIN_EVIDENCE:
             current = polish(problem, turned)
+        if "bristled" in h.options and not problem.motions_alone:
+            current = with_bristle(problem, current, effect, workers)
+            continue
         if resized is None or is_along_record(h):
             continue
         others = tuple(e for e in current.model.effects if e.hypothesis.key != h.key)
@@ -84,6 +88,24 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
         if best.cost < current.cost - MIN_EVIDENCE:
             current = polish(problem, best)
     return current
+
+
+def with_bristle(problem: Problem, current: Fit, effect: Effect, workers: Workers) -> Fit:
+    """The model with a friction that gives before it slips, as in the LuGre model, where that leaves less."""
+    law = bristled_stribeck(effect.hypothesis.joint, effect.hypothesis.place)
+    others = tuple(e for e in current.model.effects if e.hypothesis.key != law.key)
+    own = next(e for e in current.model.effects if e.hypothesis.key == law.key)
+    preds = predictions(problem, current.model, current.remainders)
+    scale = signal_scale(problem, preds, law.joint, ())
+    models = [
+        replace(current.model, effects=(*others, Effect(law, clip_to_bounds(law, p))))
+        for p in own.hypothesis.options["bristled"](own.p, scale)
+    ]
+    workers.say(f"a bristle: {law.effect} at {law.place}")
+    again = partial(refit, problem, weights=current.weights, remainders=current.remainders)
+    fits = [r for r in workers.map_in_time(again, models) if r is not None and not last_is_pointless(r)]
+    best = min(fits, key=lambda r: r.cost, default=current)
+    return polish(problem, best) if best.cost < current.cost - MIN_EVIDENCE else current
 
 
 def companions(

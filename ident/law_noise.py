@@ -150,5 +150,6 @@ def _place_of(effects: Sequence[Effect], pred: Prediction, solution: Solution) -
 
 def _along(laws: Sequence[kernels.Law], group: Group, motion: np.ndarray) -> np.ndarray:
     """Spectrum (S, L) of the torque of laws along a motion (S, L) as it is."""
-    x, rate = (group.to_time((s * motion)[..., None])[..., 0] for s in (1.0, 1j * group.omega))
-    return group.to_lines(sum(kernels.along_motion(law, x, rate) for law in laws)[..., None])[..., 0]
+    x, rate, bend = (group.to_time((s * motion)[..., None])[..., 0] for s in (1.0, 1j * group.omega, -(group.omega**2)))
+    torque = sum(kernels.along_motion(law, x, rate + law.lead * bend) for law in laws)
+    return group.to_lines(torque[..., None])[..., 0]

@@ -222,8 +222,10 @@ def _loop(
     shown = share * free
     x = grid.to_time(shown[..., None])[..., 0]
     rate = grid.to_time((1j * grid.omega * shown)[..., None])[..., 0] if kernels.sees_rate(law) else x
-    start = modal_state(guess, grid.omega, grid.period_time / grid.n_time, modes)
-    torque = grid.to_lines(steady_loop(law, x, rate, modes, start, returns=grid.recorded_share)[..., None])[..., 0]
+    step = grid.period_time / grid.n_time
+    start = modal_state(guess, grid.omega, step, modes)
+    made = steady_loop(law, x, rate, modes, start, returns=grid.recorded_share, step=step)
+    torque = grid.to_lines(made[..., None])[..., 0]
     slope = kernels.mean_slope(law, grid.to_time((shown - compliance * torque)[..., None])[..., 0])[:, None]
     # The mean is shown as it is, and a gear within its dead band has no stiffness there to answer with.
     torque[:, 1:] += slope / (1.0 + slope * compliance[1:]) * (free - shown)[:, 1:]

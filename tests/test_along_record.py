@@ -135,7 +135,7 @@ def test_columns_beside_a_gear_along_its_record_are_the_differences(rattling):
     """Of the gear, its motor, the timing and friction at the same joint, whose torque the record holds already."""
     problem, model, backlash, gap = rattling
     friction = next(h for h in catalogue(problem.structure) if h.key == ("coulomb_friction", "shoulder_pan_joint"))
-    effects = (Effect(along_record(backlash), np.array([gap, 0.0])), Effect(friction, np.array([2.0, 0.1, 5e-3])))
+    effects = (Effect(along_record(backlash), np.array([gap, 0.0])), Effect(friction, np.array([2.0, 0.1, 5e-3, 0.0])))
     model, group, n = replace(model, effects=effects), problem.groups[0], problem.structure.n
     pred = predict(model, group, problem.sampling)
     J, x = jacobian(problem, model, group, pred).dense(), pack(model)

@@ -39,7 +39,7 @@ MOVED = [
     (ECCENTRIC,),
     (("unknown:position_scale", 1.1),),
     (("gravity_spring", 500.0, 0.3),),
-    (("dress_pack", 200.0, 1e-3, 1e-2),),
+    (("dress_pack", 200.0, 1e-3, 1e-2, 0.0),),
     (PAYLOAD, ECCENTRIC),
 ]
 
@@ -65,7 +65,7 @@ def test_small_changes_of_the_position_are_passed_on_as_told(identified, named):
     "named",
     [
         (),
-        (("torque_lag", 1e-3),),
+        (("torque_lag", 1e-3, 0.0),),
         (("sensor_delay", 1e-3),),
         (("unknown:link_friction", 20.0),),
         (("torque_constant", 1.1),),

@@ -160,13 +160,15 @@ def test_an_absent_parameter_costs_what_is_lost_without_it_and_more_where_it_mak
     coulomb, drift = named["coulomb_friction", "elbow_joint"], named["friction_drift", "elbow_joint"]
     information = 1e4
     near = 0.5 * ABSENT * np.sqrt(TEMPER / information)
-    none, some = (occam(candidate(coulomb, [3.0, a, 1e-3], [1e4, information, 1.0]), TEMPER) for a in (near, 0.5))
+    none, some = (
+        occam(candidate(coulomb, [3.0, a, 1e-3, 0.0], [1e4, information, 1.0, 0.0]), TEMPER) for a in (near, 0.5)
+    )
     lost = 0.5 * (0.5 * ABSENT) ** 2
-    exactly = occam(candidate(coulomb, [3.0, 0.0, 1e-3], [1e4, information, 1.0]), TEMPER)
+    exactly = occam(candidate(coulomb, [3.0, 0.0, 1e-3, 0.0], [1e4, information, 1.0, 0.0]), TEMPER)
     assert none == pytest.approx(exactly - lost - 0.5 * (near / coulomb.parameters[1].spread) ** 2, abs=1e-3)
     assert none > some + 2.0
-    free = [information, 0.0, 1e4, 0.0]
-    absent, present = (occam(candidate(drift, [c, 60.0, 3.0, 1e-3], free), TEMPER) for c in (near, 0.5))
+    free = [information, 0.0, 1e4, 0.0, 0.0]
+    absent, present = (occam(candidate(drift, [c, 60.0, 3.0, 1e-3, 0.0], free), TEMPER) for c in (near, 0.5))
     without = -0.5 * np.log(1.0 + LOG_SPREAD**2 * 1e4 / TEMPER)
     assert absent == pytest.approx(without - POINTLESS_NATS - 0.5 * (near / 0.5) ** 2 - lost, abs=1e-3)
     assert present > absent - POINTLESS_NATS
@@ -804,7 +806,8 @@ def test_an_effect_at_its_bounds_is_none(named):
     assert [pointless(Effect(soft, np.array([share * 1e4, 1e-4])), 1e4) for share in (0.02, 0.3)] == [True, False]
     dip = named["stribeck_friction", "elbow_joint"]  # of a friction that vanishes in motion there is none
     falls = [
-        pointless(Effect(dip, np.array([coulomb, 1.0, 0.05, 1e-3, 2.0])), 1e4) for coulomb in (0.95, 0.5, 0.15, 0.01)
+        pointless(Effect(dip, np.array([coulomb, 1.0, 0.05, 1e-3, 2.0, 0.0])), 1e4)
+        for coulomb in (0.95, 0.5, 0.15, 0.01)
     ]
     assert falls == [True, False, False, True]
 
@@ -819,7 +822,7 @@ def test_a_gear_far_from_its_guess_has_gone_astray(identified):
 
 
 @pytest.mark.parametrize(
-    "effect, start", [("coulomb_friction", (1e-5, 0.0, 1e-3)), ("cogging", (1e-3, 101.0, 1e-3, 0.0, 0.0))]
+    "effect, start", [("coulomb_friction", (1e-5, 0.0, 1e-3, 0.0)), ("cogging", (1e-3, 101.0, 1e-3, 0.0, 0.0))]
 )
 def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified, named, effect, start):
     """The data hold no effect: a friction that was let in stands for nothing, and so does a ripple of whatever
@@ -862,7 +865,9 @@ def test_a_model_in_larger_noise_matches_only_what_leaves_less(identified, named
     """Larger noise makes every residual small: seen in the same noise, a model that leaves noise is as good."""
     _, setup, result = identified
     problem, joint = setup.problem, 2
-    rub = replace(result.model, effects=(Effect(named["coulomb_friction", "elbow_joint"], np.array([5.0, 0.0, 1e-3])),))
+    rub = replace(
+        result.model, effects=(Effect(named["coulomb_friction", "elbow_joint"], np.array([5.0, 0.0, 1e-3, 0.0])),)
+    )
     preds = predictions(problem, rub, result.remainders)
     wrong = replace(result, model=rub, costs=joint_costs(problem, preds, result.weights))
     loud = scaled(result.weights, 10.0)
@@ -888,7 +893,7 @@ def test_a_law_that_is_right_along_the_record_alone_needs_to_do_better_there(ide
     _, setup, result = identified
     problem = setup.problem
     own = Effect(named["hardening_stiffness", "elbow_joint"], np.array([1.0]))
-    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([5.0, 0.0, 1e-3]))
+    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([5.0, 0.0, 1e-3, 0.0]))
     right, wrong = (replace(result, model=replace(result.model, effects=e)) for e in ((own,), (rub, own)))
     j, loud = own.hypothesis.joint, scaled(result.weights, 10.0)
     along = replace(result, weights=loud, costs=1.05 * result.counts)
@@ -905,7 +910,7 @@ def test_no_strong_effect_is_sought_where_a_cause_has_left_next_to_nothing(ident
     _, setup, result = identified
     problem, j = setup.problem, 2
     h = named["coulomb_friction", "elbow_joint"]
-    rub = replace(result.model, effects=(Effect(h, np.array([5.0, 0.0, 1e-3])),))
+    rub = replace(result.model, effects=(Effect(h, np.array([5.0, 0.0, 1e-3, 0.0])),))
     # Data without friction: a model with one has the discrepancy, and costs in another noise say nothing.
     before = replace(result, model=rub, costs=0.0 * result.costs)
     found = Round(before, (Candidate(h, result, 1.0),), (), 1.0, 1.0)
@@ -1005,7 +1010,7 @@ def test_errors_of_a_law_are_not_searched_as_a_whole(identified, named, left, lo
     j, count = 2, result.counts
     at = np.eye(6)[j if own else 3] * 1e4 * np.sum(count)
     told = 1e4 * np.sum(count) * np.eye(6)[j]
-    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([3.0, 0.0, 1e-3]))
+    rub = Effect(named["coulomb_friction", "elbow_joint"], np.array([3.0, 0.0, 1e-3, 0.0]))
     current = replace(result, model=replace(result.model, effects=(rub,)), costs=count + left * at)
     assert not settled(current)
     assert settled(less_errors_of_laws(current, told)) == (own and not loudly)
@@ -1210,17 +1215,17 @@ def test_a_hysteresis_of_which_no_yielding_is_seen_is_not_trusted(named, std, tr
     """Without a limit that the data know it is a spring beside the gear's."""
     yields, rub = named["hysteresis", "elbow_joint"], named["coulomb_friction", "elbow_joint"]
     names = tuple(h.coordinate(q.name) for h in (yields, rub) for q in h.parameters)
-    final, covariance = SimpleNamespace(names=names), np.diag([1e-4, std**2, 2.0, 2.0, 2.0, 1e-4, 0.1, 2.0])
+    final, covariance = SimpleNamespace(names=names), np.diag([1e-4, std**2, 2.0, 2.0, 2.0, 1e-4, 0.1, 2.0, 1.0])
     assert shown(Effect(yields, np.array([1e4, 5.0, 5.0, 0.0, 0.0])), final, covariance) == trusted
-    assert shown(Effect(rub, np.array([5.0, 0.0, 1e-3])), final, covariance)
+    assert shown(Effect(rub, np.array([5.0, 0.0, 1e-3, 0.0])), final, covariance)
 
 
 @pytest.mark.parametrize(("std", "trusted"), [(0.1, True), (0.8, False)])
 def test_a_friction_is_larger_at_rest_only_where_that_is_more_than_chance(named, std, trusted):
     dips = named["stribeck_friction", "elbow_joint"]
     final = SimpleNamespace(names=[dips.coordinate(q.name) for q in dips.parameters])
-    covariance = np.diag([1e-6, std**2, 0.1, 0.1, 0.1])
-    assert shown(Effect(dips, np.array([2.5, 4.9, 0.03, 1e-3, 2.0])), final, covariance) == trusted
+    covariance = np.diag([1e-6, std**2, 0.1, 0.1, 0.1, 1.0])
+    assert shown(Effect(dips, np.array([2.5, 4.9, 0.03, 1e-3, 2.0, 0.0])), final, covariance) == trusted
 
 
 @pytest.mark.parametrize(("off", "trusted"), [(0.5, False), (2.0, True)])
@@ -1267,7 +1272,7 @@ def test_a_candidate_that_leaves_noise_at_its_joint_is_told_from_others(identifi
     )
 
     def with_friction(torque):
-        return replace(result, model=replace(result.model, effects=(Effect(rub, np.array([torque, 0.0, 1e-3])),)))
+        return replace(result, model=replace(result.model, effects=(Effect(rub, np.array([torque, 0.0, 1e-3, 0.0])),)))
 
     assert settles_its_joint(problem, clear, rub, with_friction(1e-3))
     assert not settles_its_joint(problem, clear, rub, with_friction(5.0))
@@ -1281,7 +1286,7 @@ def test_a_start_that_loses_the_data_is_not_followed(identified, named):
     _, setup, result = identified
     rub = named["coulomb_friction", "elbow_joint"]
     small, large, none = (
-        replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3])),)) for t in (1e-3, 50.0, np.nan)
+        replace(result.model, effects=(Effect(rub, np.array([t, 0.0, 1e-3, 0.0])),)) for t in (1e-3, 50.0, np.nan)
     )
 
     def followed(model):
@@ -1298,7 +1303,7 @@ def test_a_start_far_off_the_data_is_not_fitted_but_for_the_best(identified, nam
     """A dead band far wider than the gear ever turns: it would be hit from end to end for minutes."""
     _, setup, result = identified
     rub, gear = named["coulomb_friction", "elbow_joint"], named["backlash", "wrist_1_joint"]
-    starts = {rub.key: np.array([1e-3, 0.0, 1e-3]), gear.key: np.array([0.1, 0.0])}
+    starts = {rub.key: np.array([1e-3, 0.0, 1e-3, 0.0]), gear.key: np.array([0.1, 0.0])}
     tried = []
 
     def told(problem, model, *args, **kwargs):
@@ -1328,7 +1333,7 @@ def test_an_effect_that_the_data_need_stays_and_a_companion_that_they_do_not_goe
     data = through_files(quick_experiment(small_plan(ur10, 8, points=1, levels=(1.0,)), [hidden], seed=8), tmp_path)
     setup, result = identify(data)
     rub = {h.key: h for h in catalogue(setup.problem.structure)}["coulomb_friction", "elbow_joint"]
-    model = replace(result.model, effects=(Effect(rub, np.array([3.0, 0.0, 1e-3])),))
+    model = replace(result.model, effects=(Effect(rub, np.array([3.0, 0.0, 1e-3, 0.0])),))
     fitted = polish(setup.problem, replace(result, model=model))
     assert pruned(setup.problem, fitted) is fitted
 
@@ -1395,7 +1400,7 @@ def test_plain_friction_widens_to_laws_that_hold_it(named):
     for effect in ("stribeck_friction", "presliding_friction"):
         h, size = named[effect, "elbow_joint"], 3.0
         scale = SimpleNamespace(v=0.1, q=0.02)
-        for p in h.options["widens"](np.array([size, 0.1, 1e-3]), scale):
+        for p in h.options["widens"](np.array([size, 0.1, 1e-3, 0.0]), scale):
             assert len(p) == len(h.parameters) and not pointless(Effect(h, p), 1e4)
             assert all(q.lower < v < q.upper or v in (q.null, q.center) for q, v in zip(h.parameters, p, strict=True))
             special = h.options["special"](p)

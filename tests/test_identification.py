@@ -247,7 +247,11 @@ def test_exact_columns_are_the_differences_of_what_a_model_predicts(panda_proble
     """Gears that give under gravity move the posture, and with it all torques of a motion: with the remainder held that
     is missed."""
     problem = panda_problem
-    start = {"hardening_stiffness": [1e9], "torque_lag": [2e-3], "payload": [2.0, 0.02, 0.0, 0.05, 0.01, 0.01, 0.01]}
+    start = {
+        "hardening_stiffness": [1e9],
+        "torque_lag": [2e-3, 0.0],
+        "payload": [2.0, 0.02, 0.0, 0.05, 0.01, 0.01, 0.01],
+    }
     effects = tuple(Effect(h, np.array(start[h.effect])) for h in catalogue(problem.structure) if h.key in keys)
     model, group = Model(problem.structure, problem.nominal, effects), problem.groups[0]
     pred = predict(model, group, problem.sampling, steps=20)
@@ -277,7 +281,9 @@ def test_a_winner_beside_a_law_of_the_gear_is_fitted_by_exact_columns(panda_prob
     """And no other: the information that its deviations come from says which were used."""
     problem = panda_problem
     (h,) = (h for h in catalogue(problem.structure) if h.key == key)
-    start = Model(problem.structure, problem.nominal, (Effect(h, np.array([value, 0.0, 1e-3][: len(h.parameters)])),))
+    start = Model(
+        problem.structure, problem.nominal, (Effect(h, np.array([value, 0.0, 1e-3, 0.0][: len(h.parameters)])),)
+    )
     first = fit(problem, start, iterations=2)
     result = fit(problem, first.model, iterations=1, weights=first.weights, remainders=first.remainders, exact=True)
     preds = predictions(problem, result.model, result.remainders)
@@ -304,13 +310,13 @@ def test_columns_beside_a_loop_serve_as_long_as_they_foretell_the_cost(panda_pro
         result = fit(problem, Model(problem.structure, problem.nominal, (Effect(h, np.array(value)),)), iterations=20)
         return result, len(calls) / len(problem.groups)
 
-    (kept, some), (_, plain) = fitted(GEAR, [1e9]), fitted(LAG, [2e-3])
+    (kept, some), (_, plain) = fitted(GEAR, [1e9]), fitted(LAG, [2e-3, 0.0])
     monkeypatch.setattr("ident.torque_fit.SLIGHT", 0.0)
     monkeypatch.setattr("ident.torque_fit.FORETOLD", 0.0)
     fresh, every = fitted(GEAR, [1e9])
     assert some < 0.8 * every
     assert kept.cost - fresh.cost < SLIGHT
-    assert fitted(LAG, [2e-3])[1] == plain
+    assert fitted(LAG, [2e-3, 0.0])[1] == plain
 
 
 def test_the_baseline_is_weighted_by_the_noise_that_it_sees_itself(identified):

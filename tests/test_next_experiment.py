@@ -31,7 +31,7 @@ def fitted(clean):
         setup.problem,
         baseline,
         with_effect("hardening_stiffness", 1e9),
-        with_effect("coulomb_friction", 0.2, 0.0, 1e-3),
+        with_effect("coulomb_friction", 0.2, 0.0, 1e-3, 0.0),
     )
 
 

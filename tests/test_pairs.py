@@ -35,7 +35,7 @@ def weak_bristle(locked, tmp_path_factory):
 
 def named(problem, baseline, laws):
     """The model with dry friction, and the round that has named it before a bristle."""
-    starts = {"coulomb_friction": [5.0, 0.0, 1e-2], "presliding_friction": [6e3, 5.0, 1.0, 0.0]}
+    starts = {"coulomb_friction": [5.0, 0.0, 1e-2, 0.0], "presliding_friction": [6e3, 5.0, 1.0, 0.0]}
     effects = [Effect(laws[name], np.array(p)) for name, p in starts.items()]
     fits = [fit(problem, replace(baseline.model, effects=(e,)), weights=baseline.weights) for e in effects]
     found = weighed_round(baseline, [(e.hypothesis, r) for e, r in zip(effects, fits, strict=True)], (), {})

@@ -130,4 +130,4 @@ def test_an_error_within_the_steps_of_an_encoder_is_not_trusted():
 
     assert within(2, 6e-5, -6e-5) and not within(2, 9e-5, 6e-5)
     assert not within(1, 6e-5, -6e-5)
-    assert not within_steps(Effect(sensor_lag(2, "joint_2"), np.array([1e-5])), steps)
+    assert not within_steps(Effect(sensor_lag(2, "joint_2"), np.array([1e-5, 0.0])), steps)

@@ -70,7 +70,7 @@ def test_a_motion_that_breaks_off_leaves_nothing_of_its_ends(seed):
     impedance = [np.polyval(np.polyfit(lines[near], part[near], 8), hz) for part in (seen.real, seen.imag)]
     (group,) = build_groups(recorded((impedance[0] + 1j * impedance[1]) * size), motion_band_hz=3.0)
     error = residual(group, predict(model, group, problem.sampling))
-    assert np.linalg.norm(error) < 5e-5 * np.linalg.norm(group.observe(group.U))
+    assert np.linalg.norm(error) < 2e-5 * np.linalg.norm(group.observe(group.U))
 
 
 @pytest.mark.parametrize("seconds", [4.0, 15.0])
@@ -187,7 +187,7 @@ def test_friction_at_rest_balances_what_the_drive_delivers(scale):
         setup = set_up(moves_with_dwells(0.8, scale))
         problem, (group,) = setup.problem, setup.problem.groups
         known = {h.effect: h for h in catalogue(problem.structure)}
-        effects = [Effect(known["coulomb_friction"], np.array([0.8, 0.0, 1e-3]))]
+        effects = [Effect(known["coulomb_friction"], np.array([0.8, 0.0, 1e-3, 0.0]))]
         effects += [Effect(known["torque_constant"], np.array([scale]))] if scale != 1.0 else []
         found = predict(Model(problem.structure, problem.nominal, tuple(effects)), group, problem.sampling)
         return float(np.sqrt(np.mean(np.abs(group.observe(group.U - found.U)) ** 2)))

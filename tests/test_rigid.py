@@ -321,7 +321,7 @@ def test_a_ripple_that_a_motion_runs_over_is_not_trusted(moved):
     ripple = of["cogging", "wrist_3_joint"]
     slow, fast = (too_fast(problem, preds, Effect(ripple, np.array([1.0, k, 0.0]))) for k in (5.0, 20000.0))
     assert fast and not slow
-    rub = Effect(of["coulomb_friction", "wrist_3_joint"], np.array([1.0, 0.0, 1e-3]))
+    rub = Effect(of["coulomb_friction", "wrist_3_joint"], np.array([1.0, 0.0, 1e-3, 0.0]))
     assert not too_fast(problem, preds, rub)
 
 

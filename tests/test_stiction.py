@@ -135,7 +135,7 @@ def test_where_motors_stick_is_known():
 
 def test_dry_friction_that_sticks_leaves_little():
     """At its true figures, where the motor sticks most: a hundred times as much without what rest says."""
-    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4, 0.0])
     group = problem.groups[0]
     pred = predict(model, group, problem.sampling)
     blind = predict(model, replace(group, rest=None), problem.sampling)
@@ -203,7 +203,7 @@ def test_what_rest_leaves_of_noise():
 
 
 def test_only_a_motor_that_rests_is_held():
-    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4, 0.0])
     group: Group = problem.groups[0]
     pred = predict(model, group, problem.sampling)
     still = held(pred, group)
@@ -260,7 +260,7 @@ def test_a_drive_that_hunts_between_steps_of_its_encoder_does_not_creep():
 def test_what_is_held_hangs_on_few_parameters(monkeypatch):
     """Columns beside dry friction, against differences: far nearer to these than those of a motor that nothing
     holds."""
-    problem, model = friction("coulomb_friction", [COULOMB, 0.1, 1e-4])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.1, 1e-4, 0.0])
     group = problem.groups[0]
     pred = predict(model, group, problem.sampling)
     x, off = pack(model), {}
@@ -294,7 +294,7 @@ def test_noise_that_friction_takes_from_a_motor_at_rest_is_no_merit():
         for s in data.segments
         if s.role == "identification"
     ]
-    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4, 0.0])
     groups = build_groups(replace(data, segments=tuple(still)))
     assert all(g.rest.mean() > 0.99 for g in groups)
     for share in (0.0, 1.0):  # of the scatter between periods
@@ -310,7 +310,7 @@ def test_noise_that_friction_takes_from_a_motor_at_rest_is_no_merit():
 
 def test_rest_tells_nothing_of_a_friction_within_the_noise_of_what_is_asked():
     """Else the friction of a motor that hardly moves would explain the noise of its torque, whatever its size."""
-    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4, 0.0])
     group = problem.groups[0]
     noise = predict(model, group, problem.sampling).motion().asked_noise(0)
     assert NOISE[1] / 5 < noise < 0.2 * COULOMB
@@ -322,27 +322,27 @@ def test_rest_tells_nothing_of_a_friction_within_the_noise_of_what_is_asked():
 
 
 def test_a_law_that_has_lost_what_sets_it_apart_is_its_special_case():
-    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4, 0.0])
     laws = {h.effect: h for h in catalogue(problem.structure)}
 
     def special(effect, p):
         return plainly_special(problem, model, Effect(laws[effect], np.array(p)))
 
-    assert [special("stribeck_friction", [2.0, static, 0.01, 1e-3, 2.0]) for static in (1.7, 2.2, 2.4)] == [
+    assert [special("stribeck_friction", [2.0, static, 0.01, 1e-3, 2.0, 0.0]) for static in (1.7, 2.2, 2.4)] == [
         True,
         True,
         False,
     ]
-    assert not special("coulomb_friction", [2.0, 0.0, 1e-3])
+    assert not special("coulomb_friction", [2.0, 0.0, 1e-3, 0.0])
 
 
 def test_a_dip_within_rest_is_none_beside_a_law_along_the_record():
-    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, 1e-4, 0.0])
     laws = {h.effect: h for h in catalogue(problem.structure)}
     slow = min(g.least_velocity[:, 0].mean() for g in problem.groups)
     along = replace(model, effects=(Effect(along_record(laws["backlash"]), np.array([1e-3, 0.0])),))
     for width, beside in ((0.5, True), (10.0, False)):
-        dip = Effect(laws["stribeck_friction"], np.array([COULOMB, STATIC, width * slow, 1e-4, 2.0]))
+        dip = Effect(laws["stribeck_friction"], np.array([COULOMB, STATIC, width * slow, 1e-4, 2.0, 0.0]))
         assert plainly_special(problem, along, dip) is beside
         assert not plainly_special(problem, model, dip)
 
@@ -351,7 +351,7 @@ def test_a_dip_within_rest_is_none_beside_a_law_along_the_record():
 def test_a_friction_that_sticks_is_found_from_either_side_of_what_is_seen(begun):
     """Fits begun where it turns at once, and within a velocity that is seen: no step leads from the latter to the
     former."""
-    problem, model = friction("coulomb_friction", [COULOMB, 0.0, begun])
+    problem, model = friction("coulomb_friction", [COULOMB, 0.0, begun, 0.0])
     preds = [predict(model, g, problem.sampling) for g in problem.groups]
     weights = make_weights(problem, preds, 0.0)
     first = refit(problem, model, weights, [p.solution.W for p in preds])

@@ -12,14 +12,18 @@ from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalSca
 from robot_assets.robot import linear_joints
 
 LEAST_DAMPING = 1e-6  # s, of a gear, over its stiffness
-PER_JOINT = (
+SHARPER = (  # with a parameter that motions do not show
     friction.coulomb_friction,
     friction.stribeck_friction,
     friction.load_dependent_friction,
     friction.friction_drift,
+    link_springs.dress_pack,
+    drive.torque_lag,
+    sensing.sensor_lag,
+)
+PER_JOINT = (
     drive.cogging,
     drive.torque_constant,
-    drive.torque_lag,
     drive.torque_delay,
     drive.torque_saturation,
     transmission.hardening_stiffness,
@@ -27,9 +31,7 @@ PER_JOINT = (
     transmission.hysteresis,
     transmission.transmission_error,
     link_springs.gravity_spring,
-    link_springs.dress_pack,
     sensing.sensor_delay,
-    sensing.sensor_lag,
 )
 
 
@@ -41,7 +43,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
 
     Args:
         motions_alone: of records without multisines. Constant errors of the torque are part of the baseline there, and
-            the bristles of a friction are not damped.
+            the bristles of a friction are not damped, and none turns before the velocity does.
         held: whether the recorded torque is known to be held from sample to sample; else its record may roll off.
     """
     robot = chain.robot
@@ -50,6 +52,9 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
     linear = linear_joints(robot)
     for j, name in enumerate(names):
         out.append(drive.torque_saturation(j, name, wound_up=True))
+        if not motions_alone:
+            out.append(friction.bristled_stribeck(j, name))
+        out += [make(j, name, not motions_alone) for make in SHARPER]
         out += [make(j, name) for make in PER_JOINT]
         out.append(friction.presliding_friction(j, name, damped=not motions_alone))
         if not linear[j]:  # what errs once a turn

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.hypotheses.filters import lag, of_step
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.ripple import SECOND, ripple
 from ident.inverse import recorded_share
@@ -55,24 +56,27 @@ def torque_constant(joint: int, place: str) -> Hypothesis:
     )
 
 
-def torque_lag(joint: int, place: str) -> Hypothesis:
-    """Current loop as a first-order lag: ``delivered = recorded / (1 + s time_constant)``."""
+def torque_lag(joint: int, place: str, stepped: bool = True) -> Hypothesis:
+    """Current loop as a first-order lag: ``delivered = recorded / (1 + s time_constant)``.
 
-    def lag(p, s: np.ndarray) -> np.ndarray:
-        return 1.0 + s * p[0]
+    Args:
+        stepped: whether it may come by a share of the time constant later or sooner, as one that is stepped in time
+            does by half of a step. Motions below the modes of the links do not show it.
+    """
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         return Screen(
             (1j * motion.group.omega * motion.solution.U[..., j],),
-            lambda c: np.array([c[0]]) if c[0] > 0 else None,
+            lambda c: np.array([c[0], *none]) if c[0] > 0 else None,
         )
 
+    step, none = of_step(stepped)
     return Hypothesis(
         "torque_lag",
         place,
         joint,
         "drive",
-        (Parameter("time_constant", "s", 1e-7, 1.0, log=True),),
+        (Parameter("time_constant", "s", 1e-7, 1.0, log=True), *step),
         lambda p, motion, j, k, U: U * lag(p, 1j * motion.group.omega),
         lambda scale: [()],
         screen,

@@ -31,26 +31,46 @@ DIP = Parameter("exponent", "1", 0.5, 2.0, log=True, nuisance=True, step=1e-2, c
 TURN_SHARE = 2e-3  # velocity within which a friction turns over that of its dip, at first
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
+GIVES = 3e-4, 3e-3, 3e-2  # of a bristle before it slips, at first, over the rms motion
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
 PROJECTIONS = 2  # of what is asked at rest, onto what dry friction can be
 # of a bristle
 RELAXATION = Parameter("relaxation", "s", 0.0, 1.0, nuisance=True, center=0.0, spread=0.01, null=0.0, reported=True)
 SMOOTHING = Parameter("smoothing_velocity", "rad/s", 1e-6, 1.0, log=True, nuisance=True, step=0.05)
+# of a friction that turns before the velocity does
+LEAD = Parameter("lead", "s", 0.0, 0.1, nuisance=True, center=0.0, spread=0.01, null=0.0)
+SOFT = 0.0, 0.01  # s, at first: of a friction, and of one that is a soft constraint
+CLIPS = 1e-3  # s of it, from which it is a soft constraint, whose torque is a line between its limits
 
 
-def direction(v: np.ndarray, smoothing: float = 0.0) -> np.ndarray:
+def direction(v: np.ndarray, smoothing: float = 0.0, clipped: float = 0.0) -> np.ndarray:
     """Sign of a velocity (S, T), averaged over each step of the grid.
 
     Within a step the velocity is taken as linear, so that a reversal between two samples enters
     with its own time: a plain sign would add broadband noise of the size of the step. A smoothing
-    velocity widens the reversal as regularised and presliding friction do.
+    velocity widens the reversal as regularised and presliding friction do; ``clipped`` is the share of it that is a
+    line between the two.
     """
-    return smooth_sign(np.ascontiguousarray(v), float(smoothing))
+    return smooth_sign(np.ascontiguousarray(v), float(smoothing), float(clipped))
 
 
-def _turned(motion: Motion, j: int, smoothing: float) -> np.ndarray:
-    """``direction`` of a motor's motion (S, T)."""
-    return motion.kept(("direction", j, smoothing), lambda: direction(motion.v(j), smoothing))
+def _turned(motion: Motion, j: int, smoothing: float, lead: float = 0.0) -> np.ndarray:
+    """``direction`` of a motor's motion (S, T), which turns where ``v + lead v'`` does.
+
+    A physics engine that holds a joint by a soft constraint asks of it the acceleration ``-v / lead``: MuJoCo's
+    ``frictionloss`` is ``clip(m (v + lead v'))`` within its size (its documentation, Computation, "Friction loss").
+    """
+
+    def made() -> np.ndarray:
+        clipped = 1.0 - np.exp(-lead / CLIPS) if lead else 0.0
+        return direction(ahead(motion.v(j), motion.time_step, lead), smoothing, clipped)
+
+    return motion.kept(("direction", j, smoothing, lead), made)
+
+
+def ahead(v: np.ndarray, step: float, lead: float) -> np.ndarray:
+    """A velocity (S, T) and ``lead`` times its rate, by differences over steps of time."""
+    return v + lead * (np.roll(v, -1, axis=1) - np.roll(v, 1, axis=1)) / (2.0 * step) if lead else v
 
 
 def dry(
@@ -59,6 +79,7 @@ def dry(
     smoothing: float,
     size: np.ndarray | float,
     back: np.ndarray | float | None = None,
+    lead: float = 0.0,
 ) -> np.ndarray:
     """Dry friction (S, T), N m: its ``size`` in the direction of the motion; where the motor stands still what balances
     the drive.
@@ -68,9 +89,10 @@ def dry(
 
     Args:
         back: the size in the other direction; the same where None.
+        lead: s, by which it turns before the velocity does.
     """
     back = size if back is None else back
-    s = _turned(motion, j, smoothing)
+    s = _turned(motion, j, smoothing, lead)
     moving = np.where(s > 0, size, back) * s
     rest = resting(motion, j, smoothing)
     if rest is None:
@@ -140,17 +162,28 @@ def turns(scale: SignalScale) -> list[tuple[float]]:
     return [(f * scale.v,) for f in (1e-5, 2e-3, 0.05)]
 
 
-def coulomb_friction(joint: int, place: str) -> Hypothesis:
-    """``torque (sign v + asymmetry)`` (effects.md)."""
+def of_lead(leads: bool) -> tuple[tuple[Parameter, ...], tuple[float, ...]]:
+    """The parameter by which a friction may turn before the velocity does, and its value where it does not."""
+    return ((LEAD,), (0.0,)) if leads else ((), ())
+
+
+def coulomb_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
+    """``torque (sign v + asymmetry)`` (effects.md).
+
+    Args:
+        leads: whether it may turn before the velocity does, of this and the others. Motions below the modes of the
+            links do not show it.
+    """
+    lead, none = of_lead(leads)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        return dry(motion, j, p[2], p[0] * (1.0 + p[1]), p[0] * (1.0 - p[1]))
+        return dry(motion, j, p[2], p[0] * (1.0 + p[1]), p[0] * (1.0 - p[1]), *p[3:])
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         s = sense(motion, j, shape[0])
         return Screen(
             (s, np.abs(s)),
-            lambda c: np.array([c[0], np.clip(c[1] / c[0], -0.8, 0.8), shape[0]]) if c[0] > 0 else None,
+            lambda c: np.array([c[0], np.clip(c[1] / c[0], -0.8, 0.8), shape[0], *none]) if c[0] > 0 else None,
             shape,
         )
 
@@ -163,23 +196,25 @@ def coulomb_friction(joint: int, place: str) -> Hypothesis:
             Parameter("torque", "N m", 1e-9, 1e7, log=True),
             Parameter("asymmetry", "1", -0.95, 0.95, center=0.0, spread=ASYMMETRY_SPREAD, null=0.0),
             SMOOTHING,
+            *lead,
         ),
         law,
         turns,
         screen,
         "The residual torque of {joint} is a step in its velocity: a friction torque of {torque:.3g} N m"
         " against the motion whatever its speed.",
-        options={"dry": True, "shown": "torque", "size": lambda s: np.array([0.4 * s.torque, 0.0, 0.05 * s.v])},
+        options={"dry": True, "shown": "torque", "size": lambda s: np.array([0.4 * s.torque, 0.0, 0.05 * s.v, *none])},
     )
 
 
-def stribeck_friction(joint: int, place: str) -> Hypothesis:
+def stribeck_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """``sign v (coulomb + (static - coulomb) exp(-|v / v_s|^exponent))``: the exponent is 2, or 1, or between
     (Armstrong-Helouvry 1991)."""
+    lead, none = of_lead(leads)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         size = p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-(np.abs(motion.v(j) / p[2]) ** p[4]))
-        return dry(motion, j, p[3], size)
+        return dry(motion, j, p[3], size, None, *p[5:])
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)
@@ -190,13 +225,13 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
                 return None
             coulomb = max(c[0], 0.3 * (c[0] + c[1]))
             static = max(c[0] + c[1], 1.3 * coulomb)
-            return np.array([coulomb, static, shape[0], shape[0] * TURN_SHARE, DIP.center])
+            return np.array([coulomb, static, shape[0], shape[0] * TURN_SHARE, DIP.center, *none])
 
         return Screen((s, s * np.exp(-(np.abs(v / shape[0]) ** DIP.center))), start, shape)
 
     def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
         coulomb = max(old[0] + weights[0], 0.1 * old[0])
-        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[2], p[4]])
+        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[2], p[4], *old[3:]])
 
     return Hypothesis(
         "stribeck_friction",
@@ -209,6 +244,7 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             Parameter("stribeck_velocity", "rad/s", 1e-6, 1e2, True, step=1e-2, center=0.05, spread=1.2),
             SMOOTHING,
             DIP,
+            *lead,
         ),
         law,
         lambda scale: [(f * scale.v,) for f in (0.05, 0.15, 0.4, 1.0)],
@@ -221,12 +257,69 @@ def stribeck_friction(joint: int, place: str) -> Hypothesis:
             "apart": "stribeck_velocity",
             "shown": "static",
             "exceeds": ("static", "coulomb"),
-            "special": lambda p: np.array([p[0], 0.0, p[3]]),
+            "bristled": lambda p, s: [
+                np.array([*p[:3], p[1] / (give * max(s.q, LEAST_MOTION)), p[4]]) for give in GIVES
+            ],
+            "special": lambda p: np.array([p[0], 0.0, p[3], *p[5:]]),
             "dry": True,
             "trivial": lambda p, k: not LEAST_DIP * p[0] < p[1] < MOST_DIP * p[0],
             "plain": lambda p: p[1] < LEAST_DIP * p[0],
             "within": lambda p: p[2],
-            "widens": lambda p, s: [np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2], DIP.center]) for f in (0.05, 0.3)],
+            "widens": lambda p, s: [
+                np.array([0.6 * p[0], 1.2 * p[0], f * s.v, p[2], DIP.center, *p[3:]]) for f in (0.05, 0.3)
+            ],
+        },
+    )
+
+
+def bristled_stribeck(joint: int, place: str) -> Hypothesis:
+    """The same of a bristle that gives before it slips: as in the LuGre model, of which this is all but the damping of
+    the bristle (Canudas de Wit, Olsson, Astrom and Lischinsky, IEEE Trans. Automatic Control 40, 1995)."""
+
+    def size(v: np.ndarray, p: Sequence[float]) -> np.ndarray:
+        return p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-(np.abs(v / p[2]) ** p[4]))
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        v = motion.v(j)
+        return size(v, p) * bristle(v, motion.time_step, p[1] / p[3], DAHL)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        v = motion.v(j)
+        z = bristle(v, motion.time_step, shape[1])
+
+        def start(c):
+            if c[0] + c[1] <= 0:
+                return None
+            coulomb = max(c[0], 0.3 * (c[0] + c[1]))
+            static = max(c[0] + c[1], 1.3 * coulomb)
+            return np.array([coulomb, static, shape[0], static / shape[1], DIP.center])
+
+        return Screen((z, z * np.exp(-(np.abs(v / shape[0]) ** DIP.center))), start, shape)
+
+    def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
+        coulomb = max(old[1] + weights[0], 0.1 * old[1])
+        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[0], p[4]])
+
+    plain = stribeck_friction(joint, place)
+    coulomb, static, velocity, *_ = plain.parameters
+    stiffness = Parameter("stiffness", "N m/rad", 1e-6, 1e12, log=True, nuisance=True, step=1e-2, reported=True)
+    return replace(
+        plain,
+        parameters=(coulomb, static, velocity, stiffness, DIP),
+        law=law,
+        shapes=lambda scale: [
+            (f * scale.v, give * max(scale.q, LEAST_MOTION)) for f in (0.15, 0.5) for give in (0.003, 0.03)
+        ],
+        screen=screen,
+        options={
+            "absorbs": "presliding_friction",
+            "absorb": absorb,
+            "apart": "stribeck_velocity",
+            "shown": "static",
+            "exceeds": ("static", "coulomb"),
+            "special": lambda p: np.array([p[3], p[0], DAHL, 0.0]),
+            "trivial": plain.options["trivial"],
+            "widens": lambda p, s: [np.array([0.6 * p[1], 1.2 * p[1], f * s.v, p[0], DIP.center]) for f in (0.05, 0.3)],
         },
     )
 
@@ -281,7 +374,8 @@ def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothes
             "shown": "coulomb",
             "give": lambda p: p[1] / p[0],
             "trivial": lambda p, k: p[1] > MOST_GIVE * p[0],
-            "special": lambda p: np.array([p[1], 0.0, SHARP]),
+            # A bristle that hardly bends and is damped turns before the velocity does.
+            "special": lambda p: np.array([p[1], 0.0, SHARP, *p[3:]]),
             "widens": lambda p, s: [
                 np.array([p[0] / (f * max(s.q, LEAST_MOTION)), p[0], DAHL, *undamped]) for f in (0.02, 0.2)
             ],
@@ -289,20 +383,21 @@ def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothes
     )
 
 
-def load_dependent_friction(joint: int, place: str) -> Hypothesis:
+def load_dependent_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """``coefficient |tau_s| sign v`` (Bittencourt and Gunnarsson 2012)."""
+    lead, none = of_lead(leads)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         unit = np.abs(motion.tau_s(j)) * sense(motion, j, shape[0])
-        return Screen((unit,), lambda c: np.array([c[0], shape[0]]) if c[0] > 0 else None, shape)
+        return Screen((unit,), lambda c: np.array([c[0], shape[0], *none]) if c[0] > 0 else None, shape)
 
     return Hypothesis(
         "load_dependent_friction",
         place,
         joint,
         "motor",
-        (Parameter("coefficient", "1", 1e-9, 2.0, log=True), SMOOTHING),
-        lambda p, motion, j, k: dry(motion, j, p[1], p[0] * np.abs(motion.tau_s(j))),
+        (Parameter("coefficient", "1", 1e-9, 2.0, log=True), SMOOTHING, *lead),
+        lambda p, motion, j, k: dry(motion, j, p[1], p[0] * np.abs(motion.tau_s(j)), None, *p[2:]),
         turns,
         screen,
         "The friction torque of {joint} is {coefficient:.3g} of the torque it transmits: it differs"
@@ -311,18 +406,19 @@ def load_dependent_friction(joint: int, place: str) -> Hypothesis:
     )
 
 
-def friction_drift(joint: int, place: str) -> Hypothesis:
+def friction_drift(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """Friction times ``1 + relative_change (1 - exp(-t / time_constant))`` as the joint warms up.
 
     Viscous and Coulomb friction change alike; ``relative_change`` is negative where they fall.
     """
+    lead, none = of_lead(leads)
 
     def warming(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray]:
         return motion.par.viscous[j] * motion.v(j), warmth(motion, tau)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         drag, warm = warming(motion, j, p[1])
-        return dry(motion, j, p[3], p[2] * (1.0 + p[0] * warm)) + p[0] * warm * drag
+        return dry(motion, j, p[3], p[2] * (1.0 + p[0] * warm), None, *p[4:]) + p[0] * warm * drag
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         smoothing = 2e-3 * np.sqrt(np.mean(motion.v(j) ** 2))
@@ -333,13 +429,13 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
             coulomb = max(c[1], 1e-6)
             change = c[2] / coulomb if c[1] > 1e-6 else c[0]
             change = first_change(change) or 0.1
-            return np.array([change, shape[0], coulomb, smoothing])
+            return np.array([change, shape[0], coulomb, smoothing, *none])
 
         return Screen((warm * drag, s, warm * s), start, shape)
 
     def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
         coulomb = max(old[0] + weights[1], 0.1 * old[0])
-        return np.array([first_change(weights[2] / coulomb), p[1], coulomb, old[2]])
+        return np.array([first_change(weights[2] / coulomb), p[1], coulomb, old[2], *old[3:]])
 
     return Hypothesis(
         "friction_drift",
@@ -351,6 +447,7 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
             TIME_CONSTANT,
             Parameter("coulomb", "N m", 1e-9, 1e7, log=True, nuisance=True, reported=True),
             SMOOTHING,
+            *lead,
         ),
         law,
         time_constants,
@@ -362,7 +459,7 @@ def friction_drift(joint: int, place: str) -> Hypothesis:
             "absorbs": "coulomb_friction",
             "absorb": absorb,
             "apart": "time_constant",
-            "special": lambda p: np.array([p[2], 0.0, p[3]]),
+            "special": lambda p: np.array([p[2], 0.0, *p[3:]]),
             "essential": ("relative_change",),
             "dry": True,
         },

@@ -22,7 +22,8 @@ class Parameter:
         name, unit: as in the catalogue.
         lower, upper: physical bounds.
         log: fitted as a logarithm (positive parameters that span decades).
-        nuisance: fitted but no parameter of the catalogue; reported all the same where ``reported`` says so.
+        nuisance: fitted but no parameter of the catalogue; reported all the same where ``reported`` says so, or where it
+            is found to be there.
         step: finite-difference step in fitted coordinates.
         center, spread: a weak prior, external units, the spread in fitted coordinates; none where infinite.
         per_stiffness: ``center`` is in units of the stiffness of the joint's gear.

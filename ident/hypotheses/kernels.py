@@ -14,6 +14,7 @@ from numba import njit
 from ident.hypotheses.yielding import SLIP, along_path, yielding_point
 
 TURNED = 19.1  # argument beyond which tanh is one in double precision
+LEAST_STEP = 1e-3  # of a velocity in a step of the grid, over the width of a turn that is averaged over it
 RESOLVED = 1e-3  # of the half of a middle, within which a step of time need not be averaged over
 LEAST_SLOPE = 1e-6  # of what is solved for the torque of a middle
 NEWTON_STEPS = 30
@@ -32,6 +33,7 @@ class Law(NamedTuple):
         exponent, recoil: of an element that yields (see ``yielding``); a Maxwell slip where nothing is said.
         start: torque of such an element where a motion begins, over that at which it yields: it was left by motions
             that were not recorded. What repeats has none.
+        lead: s, by which ``LINK`` turns before the velocity does: of ``x' + lead x''`` in place of ``x'``.
     """
 
     code: int
@@ -41,18 +43,20 @@ class Law(NamedTuple):
     exponent: float = SLIP
     recoil: float = 0.0
     start: float = 0.0
+    lead: float = 0.0
 
     @property
     def shape(self) -> tuple[int, float, float, float, float, float]:
-        """What the compiled code asks for: all but the ``start``."""
+        """What the compiled code asks for: all but the ``start`` and the ``lead``."""
         return self[:6]
 
 
 @njit(cache=True, nogil=True)
-def smooth_sign(v: np.ndarray, smoothing: float) -> np.ndarray:
+def smooth_sign(v: np.ndarray, smoothing: float, clipped: float = 0.0) -> np.ndarray:
     """Sign of ``v`` (S, T), averaged over each step of the grid, in which ``v`` goes along a line.
 
-    A ``smoothing`` above zero widens the turn to ``tanh`` of that width, or of that of the step.
+    A ``smoothing`` above zero widens the turn to ``tanh`` of that width, or of that of the step; ``clipped`` is the
+    share of a turn that is a line of that width instead.
     """
     S, T = v.shape
     out = np.empty((S, T))
@@ -64,7 +68,20 @@ def smooth_sign(v: np.ndarray, smoothing: float) -> np.ndarray:
                 continue
             x = v[i, k] / np.sqrt(0.36 * slope * slope + smoothing * smoothing)
             out[i, k] = np.tanh(x) if abs(x) < TURNED else np.sign(x)
+            if clipped > 0.0:
+                line = mean_of_line(v[i, k], max(slope, LEAST_STEP * smoothing), smoothing)
+                out[i, k] += clipped * (line - out[i, k])
     return out
+
+
+@njit(cache=True, nogil=True)
+def mean_of_line(x: float, half: float, width: float) -> float:
+    """Mean of ``x / width``, at most 1 either way, over ``half`` on both sides of ``x``."""
+    total = 0.0
+    for sign in (1.0, -1.0):
+        end = abs(x + sign * half)
+        total += sign * (0.5 * end * end / width if end < width else end - 0.5 * width)
+    return total / (2.0 * half)
 
 
 @njit(cache=True, nogil=True)
@@ -357,12 +374,13 @@ def loop_sweep(
     """One period of a law that moves the arm by which it is moved (see ``loop.steady_loop``).
 
     Args:
-        code, a, b, k, exponent, recoil: as in ``Law``.
+        code, a, b, k, exponent, recoil: as in ``Law``; of ``LINK`` its ``lead`` in steps in place of the last.
         linear, rate: (T, S) position and velocity without the law, rad, rad/s; the latter for laws that ask for it
             alone.
         modes: (4, modes) complex: poles, decay, gain_old, gain_new.
         start: (modes, S) complex state of the modes one step before the period.
-        memory: (3, S) deflection, the one before and torque there; replaced by those at the end.
+        memory: (3, S) deflection, the one before and torque there; replaced by those at the end. Of ``LINK`` the second
+            is the velocity.
         out: (T, S) torque, N m; that of an earlier sweep is replaced.
         returns: step from which on the period is but a return to where it began, T where it is none: what yields is led
             to the torque ``begin`` there, N m, smoothly, as a jump would swing the arm.
@@ -415,7 +433,10 @@ def loop_sweep(
                 h[i] = linear_part * x[i] + yields
         elif code == 4:
             for i in range(S):
-                h[i] = link_point(a, b, k, free[i], free_rate[i], direct, direct_rate)
+                # Of the acceleration it is led by, the torque of this step is a part.
+                ahead = free_rate[i] + recoil * (free_rate[i] - past[i])
+                h[i] = link_point(a, b, k, free[i], ahead, direct, direct_rate * (1.0 + recoil))
+                past[i] = free_rate[i] - direct_rate * h[i]
         elif middle:
             for i in range(S):
                 new, spread = x[i], abs(x[i] - past[i])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.hypotheses import kernels
-from ident.hypotheses.friction import SMOOTHING, direction
+from ident.hypotheses.friction import SMOOTHING, SOFT, ahead, direction, of_lead
 from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen
 from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
@@ -46,31 +46,33 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
     )
 
 
-def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
+def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False) -> Hypothesis:
     """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``.
 
     Args:
+        leads: whether it may turn before the velocity does (see ``friction``).
         yields: whether the friction turns over with the path, as of cables that give before they slip (Dahl 1968), in
             place of the velocity.
     """
+    lead, _ = of_lead(leads)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        v, q = motion.v_link(j), motion.q_link(j)
+        v, q = ahead(motion.v_link(j), motion.time_step, sum(shape)), motion.q_link(j)
         turn = 0.02 * float(np.sqrt(np.mean(v**2)))
         give = YIELDS * float(np.std(q))
 
         def start(c):
-            own = (give, 0.0) if yields else (turn,)
+            own = (give, 0.0) if yields else (turn, *shape)
             return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *own]) if max(c[0], c[1]) > 0 else None
 
         if not yields:
-            return Screen((q, direction(v, turn)), start)
+            return Screen((q, direction(v, turn)), start, shape)
         return Screen((q, elastoplastic(q, 1.0 / max(give, 1e-12), 1.0, begins=motion.group.window is not None)), start)
 
     own = (
         (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START)
         if yields
-        else (SMOOTHING,)
+        else (SMOOTHING, *lead)
     )
     return Hypothesis(
         "dress_pack",
@@ -83,7 +85,7 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
             *own,
         ),
         None,
-        lambda scale: [()],
+        lambda scale: [(x,) for x in SOFT] if lead and not yields else [()],
         screen,
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
@@ -91,7 +93,7 @@ def dress_pack(joint: int, place: str, yields: bool = False) -> Hypothesis:
             "loop": lambda p: (
                 kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2], start=p[3])
                 if yields
-                else kernels.Law(kernels.LINK, p[0], p[1], p[2])
+                else kernels.Law(kernels.LINK, *p[:3], lead=sum(p[3:]))
             ),
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the
             # motor.

@@ -20,6 +20,7 @@ def steady_loop(
     guess: np.ndarray | None = None,
     *,
     returns: float = 1.0,
+    step: float = 1.0,
 ) -> np.ndarray:
     """Torque (S, T) of a law in steady state with the arm, N m.
 
@@ -35,10 +36,12 @@ def steady_loop(
         guess: (modes, S) complex state from which to begin; rest where None.
         returns: share of the period from which on it is but a return that closes a motion, in which what yields comes
             to the ``start`` of the law; 1 where there is none.
+        step: s, of time, for laws that lead.
     """
     code, a, b, k = law[:4]
     S, T = linear.shape
     remembers = code in (HYSTERESIS, CABLE)
+    shape = (*law.shape[:5], law.lead / step) if code == LINK else law.shape
     last = round(returns * T) if remembers else T
     unit = np.array([[1.0], [1.0], [k]])  # of what is remembered, in which it is a deflection
     poles, decay, _, _ = modes
@@ -46,18 +49,20 @@ def steady_loop(
     linear, rate = np.ascontiguousarray(linear.T), np.ascontiguousarray(rate.T)
     start = np.zeros((len(decay), S), complex) if guess is None else guess
     x = linear[-1] - start.real.sum(axis=0)
+    older = x
     if code == LINK:
-        h = a * x + b * np.tanh((rate[-1] - (poles @ start).real) / k)
+        older = rate[-1] - (poles @ start).real
+        h = a * x + b * np.tanh(older / k)
     elif code == CABLE:
         h = a * x
     else:
         h = along_motion(law, x[:, None], np.zeros((S, 1)))[:, 0]
-    memory, left = np.stack([x, x, h]), np.arange(S)
+    memory, left = np.stack([x, older, h]), np.arange(S)
     out, part = np.zeros((T, S)), np.zeros((T, S))
     past: list[tuple[np.ndarray, np.ndarray]] = []
     for sweep in range(SWEEPS):
         before = memory.copy()
-        end, change = loop_sweep(*law.shape, linear, rate, modes, start, memory, part, last, b * law.start)
+        end, change = loop_sweep(*shape, linear, rate, modes, start, memory, part, last, b * law.start)
         # The state that the torque of this period repeats.
         move = (end - whole * start) / (1.0 - whole) - start
         moving = change > STEADY if sweep else np.ones(len(left), bool)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.hypotheses.drive import SCALE, scale_of
+from ident.hypotheses.filters import lag, of_step
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.motion import Motion
 
@@ -38,28 +39,33 @@ def sensor_delay(joint: int, place: str) -> Hypothesis:
     )
 
 
-def sensor_lag(joint: int, place: str) -> Hypothesis:
-    """Measured position is filtered: the true one is ``(1 + s time_constant)`` times it."""
+def sensor_lag(joint: int, place: str, stepped: bool = True) -> Hypothesis:
+    """Measured position is filtered: the true one is ``(1 + s time_constant)`` times it.
+
+    Args:
+        stepped: as of ``torque_lag``.
+    """
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        return 1j * motion.group.omega * p[0] * motion.solution.Q[..., j]
+        return (lag(p, 1j * motion.group.omega) - 1.0) * motion.solution.Q[..., j]
 
+    step, none = of_step(stepped)
     return Hypothesis(
         "sensor_lag",
         place,
         joint,
         "position",
-        (Parameter("time_constant", "s", 1e-7, 1.0, log=True),),
+        (Parameter("time_constant", "s", 1e-7, 1.0, log=True), *step),
         law,
         lambda scale: [()],
         lambda motion, j, k, shape: Screen(
             (1j * motion.group.omega * motion.solution.Q[..., j],),
-            lambda c: np.array([c[0]]) if c[0] > 0 else None,
+            lambda c: np.array([c[0], *none]) if c[0] > 0 else None,
         ),
         "The position of {joint} passes a filter of {time_constant:.3g} s: phase and gain of one row of the FRF"
         " fall with frequency.",
         variable="v",
-        options={"filter": lambda p, s: 1.0 + s * p[0]},
+        options={"filter": lag},
     )
 
 

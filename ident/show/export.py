@@ -328,7 +328,7 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
     gear, drive = spec.tendon(f"gear:{name}"), spec.actuator(f"drive:{name}")
     step = spec.option.timestep
     if cause.effect == "coulomb_friction":
-        _add_friction(motor, p["torque"], step)
+        _add_friction(motor, p["torque"], step, p.get("lead", 0.0))
         bias = p["torque"] * p.get("asymmetry", 0.0)
         if bias:
             _add_passive(spec, index, name, cogging=[-bias, 0.0, 0.5 * np.pi])
@@ -350,14 +350,14 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
     elif cause.effect == "torque_constant":
         drive.gear = [drive.gear[0] * p["scale"], 0, 0, 0, 0, 0]
     elif cause.effect == "torque_delay":
-        lead = 0.0 if drive.delay else stage_lead(step, spec.option.integrator)
-        drive.delay += p["delay"] + lead
-        # Linear between past steps: over a step in which the input changes it delivers the mean.
-        drive.interp, drive.nsample = 1, int(np.ceil(drive.delay / step)) + 2
+        _add_delay(drive, p["delay"], step, spec.option.integrator)
     elif cause.effect == "torque_lag":
         exact = spec.option.integrator != mujoco.mjtIntegrator.mjINT_RK4
         drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
-        drive.dynprm = [p["time_constant"], *([0] * (len(drive.dynprm) - 1))]
+        late = p["time_constant"] * p.get("stepped", 0.0)
+        drive.dynprm = [p["time_constant"] + min(late, 0.0), *([0] * (len(drive.dynprm) - 1))]
+        if late > 0.0:
+            _add_delay(drive, late, step, spec.option.integrator)
     elif cause.effect == "torque_saturation":
         drive.forcelimited, drive.forcerange = True, [-p["limit"], p["limit"]]
     elif cause.effect == "hardening_stiffness":
@@ -375,7 +375,7 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
     elif cause.effect in ("gravity_spring", "dress_pack"):
         _add_spring(link, p["stiffness"], p.get("rest_angle", 0.0))
         if p.get("friction", 0.0) > 0:
-            _add_friction(link, p["friction"], step)
+            _add_friction(link, p["friction"], step, p.get("lead", 0.0))
     elif cause.effect == "sensor_delay":
         side = "link" if cause.channel == "q_link" else "motor"
         sensor = spec.add_sensor(name=f"encoder:{index}", type=mujoco.mjtSensor.mjSENS_JOINTPOS)
@@ -384,10 +384,17 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         sensor.nsample = int(np.ceil(p["delay"] / step)) + 2
 
 
-def _add_friction(joint: mujoco.MjsJoint, torque: float, step: float) -> None:
-    """Dry friction that turns as sharply as the step allows; MuJoCo's default turns over 0.01 s of sliding."""
+def _add_delay(drive: mujoco.MjsActuator, delay: float, step: float, integrator: int) -> None:
+    """A delay of a torque, s, linear between past steps: over one in which the input changes it delivers the mean."""
+    drive.delay += delay + (0.0 if drive.delay else stage_lead(step, integrator))
+    drive.interp, drive.nsample = 1, int(np.ceil(drive.delay / step)) + 2
+
+
+def _add_friction(joint: mujoco.MjsJoint, torque: float, step: float, lead: float = 0.0) -> None:
+    """Dry friction that turns as sharply as the step allows, or ``lead`` s before the velocity does; by MuJoCo's default
+    it is 0.01 s."""
     joint.frictionloss += torque
-    joint.solref_friction, joint.solimp_friction = [2.0 * step, 1.0], TIGHT
+    joint.solref_friction, joint.solimp_friction = [2.0 * max(step, lead / TIGHT[1]), 1.0], TIGHT
 
 
 def _add_passive(spec: mujoco.MjSpec, index: int | str, joint: str, **parts: list[float]) -> None:
