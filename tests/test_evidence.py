@@ -834,6 +834,16 @@ def test_effects_of_which_nothing_is_left_are_taken_out_of_the_model(identified,
     assert found.cost < result.cost * (1.0 + 1e-6)
 
 
+def test_a_gear_with_a_middle_that_no_record_leaves_is_a_spring_of_that_slope(identified, named):
+    _, setup, result = identified
+    soft, stiffness = named["softening_stiffness", "elbow_joint"], result.model.par.stiffness
+    par = replace(result.model.par, stiffness=stiffness * np.array([1, 1, 2, 1, 1, 1]))
+    model = replace(result.model, par=par, effects=(Effect(soft, np.array([stiffness[2], 0.5])),))
+    found = pruned(setup.problem, polish(setup.problem, replace(result, model=model)))
+    assert found.model.effects == ()
+    assert found.model.par.stiffness == pytest.approx(stiffness, rel=1e-4)
+
+
 def scaled(weights, factor):
     """Weights of a noise that is larger by a factor."""
     return Weights(tuple(w / factor for w in weights.whiten), tuple(factor**2 * c for c in weights.covariance))

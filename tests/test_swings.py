@@ -1,11 +1,14 @@
 """What the arm swings by itself from period to period: taken off exactly, and no noise any more."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from ident.diagnosis import beside_steady_records
 from ident.identification import identify
+from ident.parallel import Workers
 from ident.plan import make_plan
 from ident.problem import predictions
 from ident.swings import by_ends, without_swings
@@ -57,3 +60,23 @@ def test_nothing_is_taken_off_where_a_model_is_far_from_the_data(clean, monkeypa
     data = replace(clean[0], segments=tuple(replace(s, tau=s.tau * wrong) for s in clean[0].segments))
     _, result = identify(data)
     assert (result.chi2_per_dof > 3.0) == (scale > 1.0) == (not asked)
+
+
+@dataclass(frozen=True)
+class Stage:
+    problem: str
+
+
+@pytest.mark.parametrize(("left", "first", "again"), [(2.0, 20.0, True), (1.0, 20.0, False), (2.0, 2.0, False)])
+def test_records_are_taken_without_swings_beside_causes_that_bring_the_model_near(monkeypatch, left, first, again):
+    """And not where next to nothing is left, or where the first model was as near."""
+    baseline, final = (SimpleNamespace(chi2_per_dof=x) for x in (first, left))
+    asked = []
+    monkeypatch.setattr("ident.diagnosis.swings", lambda problem, fit: fit.chi2_per_dof < 3.0)
+    monkeypatch.setattr("ident.diagnosis.without_swings", lambda problem, fit: f"{problem} without {fit.chi2_per_dof}")
+    monkeypatch.setattr("ident.diagnosis.renewed", lambda problem, fit: fit)
+    monkeypatch.setattr("ident.diagnosis.attribute", lambda problem, fit, known, **rest: asked.append(problem) or known)
+    result = SimpleNamespace(rounds=["a cause"], final=final)
+    setup, *_ = beside_steady_records(Stage("records"), baseline, result, 4, Workers())
+    assert asked == (["records without 2.0"] if again else [])
+    assert setup.problem == (asked[0] if again else "records")
