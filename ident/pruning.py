@@ -191,11 +191,22 @@ def level(result: Fit, effect: Effect, covariance: np.ndarray) -> bool:
     return bool(np.log(larger / smaller) < ABSENT * np.sqrt(off @ covariance[np.ix_(pair, pair)] @ off))
 
 
+def leads_by(problem: Problem, effect: Effect) -> list[float]:
+    """Velocities, rad/s, by which the turn of a friction leads in each group: rms; 0 where it does not."""
+    names = [q.name for q in effect.hypothesis.parameters]
+    lead, j = effect.value("lead") if "lead" in names else 0.0, effect.hypothesis.joint
+    return [
+        lead * float(np.sqrt(2.0 * np.mean(np.sum(np.abs(g.omega**2 * g.Q[..., j]) ** 2, axis=1))))
+        for g in problem.groups
+    ]
+
+
 def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
-    """Whether an effect is its special case by its parameters, or beside laws along the record.
+    """Whether an effect is its special case by its parameters, beside laws along the record, or where it turns early.
 
     Along the record nothing says what friction takes of the torque while a motor rests: what a friction has within
-    velocities at which it may as well rest is an error of that.
+    velocities at which it may as well rest is an error of that. So is what it has within those by which its turn leads:
+    a soft constraint that has a lead takes there what is asked of it.
     """
     h = effect.hypothesis
     if h.options.get("plain", lambda p: False)(effect.p):
@@ -203,6 +214,8 @@ def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
     if "within" not in h.options:
         return False
     v = h.options["within"](effect.p)
+    if all(v < x for x in leads_by(problem, effect)):
+        return True
 
     def unseen(group: Group) -> bool:
         rests = group.rest is not None and bool(np.any(group.rest[..., h.joint]))

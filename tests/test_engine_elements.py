@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import diagnose
+from ident.hypotheses import catalogue
 from ident.hypotheses.friction import dry
+from ident.model import Effect
+from ident.pruning import leads_by, plainly_special
 from sim.effects.structure import add_spring
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -153,3 +156,22 @@ def test_a_friction_that_is_a_soft_constraint_is_named_and_measured(locked, tmp_
     assert verdict.causes[0].probability > 0.9
     assert verdict.causes[0].parameters[size].value == pytest.approx(hidden.friction, rel=0.05)
     assert verdict.unexplained_verdict == "noise floor reached"
+
+
+def test_a_dip_within_velocities_by_which_a_friction_leads_is_none(identified):
+    """There a soft constraint takes what is asked of it, whatever its size."""
+    _, setup, result = identified
+    dip = next(
+        h for h in catalogue(setup.problem.structure) if h.effect == "stribeck_friction" and len(h.parameters) == 6
+    )
+
+    def special(width, lead):
+        return plainly_special(setup.problem, result.model, Effect(dip, np.array([2.0, 4.0, width, 1e-3, 2.0, lead])))
+
+    led = leads_by(setup.problem, Effect(dip, np.array([2.0, 4.0, 0.1, 1e-3, 2.0, 2e-3])))
+    accelerations = [
+        np.sqrt(np.mean(g.to_time(-(g.omega[:, None] ** 2) * g.Q)[..., dip.joint] ** 2)) for g in setup.problem.groups
+    ]
+    assert led == pytest.approx([2e-3 * a for a in accelerations], rel=1e-6)
+    assert special(0.5 * min(led), 2e-3)
+    assert not special(2.0 * max(led), 2e-3) and not special(0.5 * min(led), 0.0)
