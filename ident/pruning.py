@@ -22,6 +22,7 @@ from ident.torque_fit import Fit
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 # velocity over that at which a motor may as well rest, up to which friction may stand for what holds it then
 NEXT_TO_REST = 2.0
+LED = 0.3  # of the velocity by which the turn of a friction leads, within which its size is not known
 # of what a friction explains of motions, that errors of its law where it turns leave
 TURNS_LEAVE = 1e-3
 
@@ -214,7 +215,7 @@ def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
     if "within" not in h.options:
         return False
     v = h.options["within"](effect.p)
-    if all(v < x for x in leads_by(problem, effect)):
+    if all(v < LED * x for x in leads_by(problem, effect)):
         return True
 
     def unseen(group: Group) -> bool:

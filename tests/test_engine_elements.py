@@ -12,7 +12,7 @@ from ident.diagnosis import diagnose
 from ident.hypotheses import catalogue
 from ident.hypotheses.friction import dry
 from ident.model import Effect
-from ident.pruning import leads_by, plainly_special
+from ident.pruning import LED, leads_by, plainly_special
 from sim.effects.structure import add_spring
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -173,5 +173,5 @@ def test_a_dip_within_velocities_by_which_a_friction_leads_is_none(identified):
         np.sqrt(np.mean(g.to_time(-(g.omega[:, None] ** 2) * g.Q)[..., dip.joint] ** 2)) for g in setup.problem.groups
     ]
     assert led == pytest.approx([2e-3 * a for a in accelerations], rel=1e-6)
-    assert special(0.5 * min(led), 2e-3)
-    assert not special(2.0 * max(led), 2e-3) and not special(0.5 * min(led), 0.0)
+    assert special(0.5 * LED * min(led), 2e-3)
+    assert not special(2.0 * LED * max(led), 2e-3) and not special(0.5 * LED * min(led), 0.0)
