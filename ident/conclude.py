@@ -416,6 +416,7 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
     if h.effect in ("transverse_elasticity", "base_elasticity"):
         axis = h.options["axis"](effect.p)
         spread = axis_std(h, effect.p, np.array([std[q.name] for q in h.parameters]))
+        out = {name: value for name, value in out.items() if not name.startswith("tilt_")}
         out |= {f"axis_{n}": Value(float(a), float(s), "1") for n, a, s in zip("xyz", axis, spread, strict=True)}
         if h.options["before"]:
             out["before"] = Value(1.0, 0.0, "1")
