@@ -28,6 +28,7 @@ MOST_WAVES = 2  # of a ripple, beside the best, of those found and of those that
 NEAR_WAVE = 0.9  # of the gain of the best
 NEAR_ORDER = 0.5  # the same of a wave that a motor has: several of any length fit a few postures by chance
 SAME_WAVE = 0.02  # relative, of two
+RIPPLES = 0.5  # of the excess at its joint, from which a ripple is also begun at what motors have
 SHIFT = 1e-4  # rad or m, of a position along which a motion is predicted once more
 
 
@@ -208,7 +209,8 @@ def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequen
             # A resonance that is taken away says nothing of one that is missing elsewhere.
             hinge = "hinge" in h.options
             first, *others = sorted(scores, key=lambda s: (hinge and s.start is None, -s.gain))
-            ratio = stage.problem.structure.robot.joints[h.joint].gear_ratio
+            excess = float(stage.fit.costs[h.joint] - stage.fit.counts[h.joint])
+            ratio = stage.problem.structure.robot.joints[h.joint].gear_ratio if first.gain > RIPPLES * excess else 0.0
             best.append(replace(first, near=other_waves(first, others, motor_orders(ratio))) if h.repeats else first)
     return best
 
