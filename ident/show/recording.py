@@ -56,9 +56,11 @@ def write_recording(diagnosis: Diagnosis, path: Path) -> None:
 def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
     joints = _worst_joints(diagnosis)
     unit = units_of_torques(diagnosis.robot)
-    torques = [rrb.TimeSeriesView(origin=f"torque/{joints[0]}", name=f"{joints[0]}: motor torque, {unit[joints[0]]}")]
+    torques = [
+        rrb.TimeSeriesView(origin=f"torque/{part(joints[0])}", name=f"{joints[0]}: motor torque, {unit[joints[0]]}")
+    ]
     torques += [
-        rrb.TimeSeriesView(origin=f"error/{name}", name=f"{name}: torque error, {unit[name]}") for name in joints
+        rrb.TimeSeriesView(origin=f"error/{part(name)}", name=f"{name}: torque error, {unit[name]}") for name in joints
     ]
     responses = [rrb.Spatial2DView(origin="frf", name=f"FRF at {view.operating_point}") for view in diagnosis.frf[:1]]
     left = rrb.Vertical(
@@ -124,16 +126,21 @@ def _markdown(diagnosis: Diagnosis) -> str:
     return "\n".join(rows)
 
 
+def part(name: str) -> str:
+    """A joint or a link in the path of an entity, whatever signs its name has."""
+    return rr.escape_entity_path_part(name)
+
+
 def _log_torques(stream: rr.RecordingStream, trace: TorqueTrace, joints: tuple[str, ...]) -> None:
     step = max(1, len(trace.t) // 4000)
     times = [rr.TimeColumn("time", duration=trace.t[::step])]
     for j, name in enumerate(joints):
         for kind, values in (("measured", trace.measured), ("before", trace.before), ("after", trace.after)):
-            entity = f"torque/{name}/{kind}"
+            entity = f"torque/{part(name)}/{kind}"
             stream.log(entity, rr.SeriesLines(colors=COLORS[kind], names=kind, widths=1.5), static=True)
             stream.send_columns(entity, times, rr.Scalars.columns(scalars=values[::step, j]))
         for kind, values in (("before", trace.before), ("after", trace.after)):
-            entity = f"error/{name}/{kind}"
+            entity = f"error/{part(name)}/{kind}"
             stream.log(entity, rr.SeriesLines(colors=COLORS[kind], names=kind, widths=1.5), static=True)
             error = (trace.measured - values)[::step, j]
             stream.send_columns(entity, times, rr.Scalars.columns(scalars=error))
@@ -159,7 +166,7 @@ def _log_arm(stream: rr.RecordingStream, diagnosis: Diagnosis, trace: TorqueTrac
     for k in range(1, model.njoints):
         name = model.names[k]
         stream.send_columns(
-            f"arm/{name}", column, rr.Transform3D.columns(translation=track[:, k], quaternion=rotations[:, k])
+            f"arm/{part(name)}", column, rr.Transform3D.columns(translation=track[:, k], quaternion=rotations[:, k])
         )
     if not meshes:
         for i, t in enumerate(times):
@@ -186,8 +193,8 @@ def _log_meshes(stream: rr.RecordingStream, robot: Robot) -> bool:
         if file.suffix.lower() not in (".stl", ".obj", ".glb") or not file.is_file():
             continue
         joint = full.names[shape.parentJoint]
-        parent = f"arm/{joint}" if shape.parentJoint else "arm/base"
-        entity = f"{parent}/{shape.name}"
+        parent = f"arm/{part(joint)}" if shape.parentJoint else "arm/base"
+        entity = f"{parent}/{part(shape.name)}"
         M = shape.placement
         stream.log(
             entity,
