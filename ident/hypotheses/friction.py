@@ -207,25 +207,35 @@ def coulomb_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     )
 
 
+def _dipping(v: np.ndarray, p: Sequence[float]) -> np.ndarray:
+    """Size of a Stribeck friction, N m, at velocities (S, T)."""
+    return p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-(np.abs(v / p[2]) ** p[4]))
+
+
+def _first_sizes(c: np.ndarray) -> tuple[float, float] | None:
+    """Coulomb and static friction to begin with, N m, where a linear step asks for ``c`` of the one and of what is more
+    at rest; None where it asks for none."""
+    if c[0] + c[1] <= 0:
+        return None
+    coulomb = max(c[0], 0.3 * (c[0] + c[1]))
+    return coulomb, max(c[0] + c[1], 1.3 * coulomb)
+
+
 def stribeck_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """``sign v (coulomb + (static - coulomb) exp(-|v / v_s|^exponent))``: the exponent is 2, or 1, or between
     (Armstrong-Helouvry 1991)."""
     lead, none = of_lead(leads)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        size = p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-(np.abs(motion.v(j) / p[2]) ** p[4]))
-        return dry(motion, j, p[3], size, None, *p[5:])
+        return dry(motion, j, p[3], _dipping(motion.v(j), p), None, *p[5:])
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)
         s = sense(motion, j, shape[0] * TURN_SHARE)
 
         def start(c):
-            if c[0] + c[1] <= 0:
-                return None
-            coulomb = max(c[0], 0.3 * (c[0] + c[1]))
-            static = max(c[0] + c[1], 1.3 * coulomb)
-            return np.array([coulomb, static, shape[0], shape[0] * TURN_SHARE, DIP.center, *none])
+            sizes = _first_sizes(c)
+            return sizes and np.array([*sizes, shape[0], shape[0] * TURN_SHARE, DIP.center, *none])
 
         return Screen((s, s * np.exp(-(np.abs(v / shape[0]) ** DIP.center))), start, shape)
 
@@ -276,23 +286,17 @@ def bristled_stribeck(joint: int, place: str) -> Hypothesis:
     """The same of a bristle that gives before it slips: as in the LuGre model, of which this is all but the damping of
     the bristle (Canudas de Wit, Olsson, Astrom and Lischinsky, IEEE Trans. Automatic Control 40, 1995)."""
 
-    def size(v: np.ndarray, p: Sequence[float]) -> np.ndarray:
-        return p[0] + max(p[1] - p[0], 0.1 * p[0]) * np.exp(-(np.abs(v / p[2]) ** p[4]))
-
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         v = motion.v(j)
-        return size(v, p) * bristle(v, motion.time_step, p[1] / p[3], DAHL)
+        return _dipping(v, p) * bristle(v, motion.time_step, p[1] / p[3], DAHL)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)
         z = bristle(v, motion.time_step, shape[1])
 
         def start(c):
-            if c[0] + c[1] <= 0:
-                return None
-            coulomb = max(c[0], 0.3 * (c[0] + c[1]))
-            static = max(c[0] + c[1], 1.3 * coulomb)
-            return np.array([coulomb, static, shape[0], static / shape[1], DIP.center])
+            sizes = _first_sizes(c)
+            return sizes and np.array([*sizes, shape[0], sizes[1] / shape[1], DIP.center])
 
         return Screen((z, z * np.exp(-(np.abs(v / shape[0]) ** DIP.center))), start, shape)
 
