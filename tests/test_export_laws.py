@@ -155,6 +155,24 @@ def test_a_lagging_drive_loses_its_time_constant(bench, lag):
     assert lost_time(model, data) == pytest.approx(lag, rel=1e-2)
 
 
+@pytest.mark.parametrize("stepped", [-0.25, 0.25])
+def test_a_lag_that_is_stepped_in_time_loses_as_much_more_or_less(bench, stepped):
+    model, data = exported(bench, cause("torque_lag", JOINT, time_constant=1e-3, stepped=stepped))
+    assert lost_time(model, data) == pytest.approx(1e-3 * (1.0 + stepped), rel=1e-2)
+
+
+@pytest.mark.parametrize("lead", [2e-3, 9.5e-3])
+def test_a_friction_that_leads_slows_its_motor_within_that_time(bench, lead):
+    """A soft constraint asks for ``v' = -v / lead`` as far as its size reaches."""
+    model, data = exported(bench, cause("coulomb_friction", JOINT, torque=0.3, lead=lead))
+    j = model.joint(f"motor:{JOINT}").dofadr[0]
+    model.tendon_stiffness[0], model.tendon_damping[0], model.dof_damping[j] = 0.0, 0.0, 0.0
+    first = data.qvel[j] = 0.5 * lead * 0.3 / model.dof_M0[j]
+    while data.time < lead - 0.5 * model.opt.timestep:
+        mujoco.mj_step(model, data)
+    assert data.qvel[j] / first == pytest.approx(np.exp(-data.time / lead), rel=0.02)
+
+
 def lost_time(model, data):
     """Time by which the velocity of the free rotor is behind that of an immediate unit step of torque."""
     j = model.joint(f"motor:{JOINT}").dofadr[0]

@@ -350,14 +350,15 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
     elif cause.effect == "torque_constant":
         drive.gear = [drive.gear[0] * p["scale"], 0, 0, 0, 0, 0]
     elif cause.effect == "torque_delay":
-        _add_delay(drive, p["delay"], step, spec.option.integrator)
+        lead = 0.0 if drive.delay else stage_lead(step, spec.option.integrator)
+        _add_delay(drive, p["delay"] + lead, step)
     elif cause.effect == "torque_lag":
         exact = spec.option.integrator != mujoco.mjtIntegrator.mjINT_RK4
         drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
         late = p["time_constant"] * p.get("stepped", 0.0)
         drive.dynprm = [p["time_constant"] + min(late, 0.0), *([0] * (len(drive.dynprm) - 1))]
         if late > 0.0:
-            _add_delay(drive, late, step, spec.option.integrator)
+            _add_delay(drive, late, step)  # a filter integrates its input, whenever stages read it
     elif cause.effect == "torque_saturation":
         drive.forcelimited, drive.forcerange = True, [-p["limit"], p["limit"]]
     elif cause.effect == "hardening_stiffness":
@@ -384,9 +385,9 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         sensor.nsample = int(np.ceil(p["delay"] / step)) + 2
 
 
-def _add_delay(drive: mujoco.MjsActuator, delay: float, step: float, integrator: int) -> None:
+def _add_delay(drive: mujoco.MjsActuator, delay: float, step: float) -> None:
     """A delay of a torque, s, linear between past steps: over one in which the input changes it delivers the mean."""
-    drive.delay += delay + (0.0 if drive.delay else stage_lead(step, integrator))
+    drive.delay += delay
     drive.interp, drive.nsample = 1, int(np.ceil(drive.delay / step)) + 2
 
 
