@@ -14,7 +14,7 @@ from ident.baseline import DETECTION_EXCESS
 from ident.evidence import Candidate, last_is_pointless
 from ident.hypotheses import Hypothesis
 from ident.hypotheses.friction import bristled_stribeck
-from ident.model import Effect, is_along_record
+from ident.model import Effect, Model, is_along_record
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
 from ident.pruning import plainer
@@ -72,7 +72,7 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
         if turned.cost < current.cost - MIN_EVIDENCE:
             current = polish(problem, turned)
         if "bristled" in h.options and not problem.motions_alone:
-            current = with_bristle(problem, current, effect, workers)
+            current = with_bristle(problem, current, h, workers)
             continue
         if resized is None or is_along_record(h):
             continue
@@ -80,32 +80,31 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
         sizes = [clip_to_bounds(h, resized(effect.p, f, current.model.par.stiffness[j])) for f in LOOP_SIZES[1:]]
         models = [replace(current.model, effects=(*others, Effect(h, p))) for p in sizes]
         workers.say(f"other motions: {h.effect} at {h.place}")
-        again = partial(refit, problem, weights=current.weights, remainders=current.remainders)
-        fits = workers.map_in_time(again, models)
-        best = min(
-            (r for r in fits if r is not None and not last_is_pointless(r)), key=lambda r: r.cost, default=current
-        )
-        if best.cost < current.cost - MIN_EVIDENCE:
-            current = polish(problem, best)
+        current = better_of(problem, current, models, workers)
     return current
 
 
-def with_bristle(problem: Problem, current: Fit, effect: Effect, workers: Workers) -> Fit:
+def better_of(problem: Problem, current: Fit, models: Sequence[Model], workers: Workers) -> Fit:
+    """The best of models that are fitted as a fit was, where it leaves clearly less; that fit elsewhere."""
+    again = partial(refit, problem, weights=current.weights, remainders=current.remainders)
+    fits = workers.map_in_time(again, models)
+    best = min((r for r in fits if r is not None and not last_is_pointless(r)), key=lambda r: r.cost, default=current)
+    return polish(problem, best) if best.cost < current.cost - MIN_EVIDENCE else current
+
+
+def with_bristle(problem: Problem, current: Fit, stribeck: Hypothesis, workers: Workers) -> Fit:
     """The model with a friction that gives before it slips, as in the LuGre model, where that leaves less."""
-    law = bristled_stribeck(effect.hypothesis.joint, effect.hypothesis.place)
+    law = bristled_stribeck(stribeck.joint, stribeck.place)
     others = tuple(e for e in current.model.effects if e.hypothesis.key != law.key)
     own = next(e for e in current.model.effects if e.hypothesis.key == law.key)
     preds = predictions(problem, current.model, current.remainders)
     scale = signal_scale(problem, preds, law.joint, ())
     models = [
         replace(current.model, effects=(*others, Effect(law, clip_to_bounds(law, p))))
-        for p in own.hypothesis.options["bristled"](own.p, scale)
+        for p in stribeck.options["bristled"](own.p, scale)
     ]
     workers.say(f"a bristle: {law.effect} at {law.place}")
-    again = partial(refit, problem, weights=current.weights, remainders=current.remainders)
-    fits = [r for r in workers.map_in_time(again, models) if r is not None and not last_is_pointless(r)]
-    best = min(fits, key=lambda r: r.cost, default=current)
-    return polish(problem, best) if best.cost < current.cost - MIN_EVIDENCE else current
+    return better_of(problem, current, models, workers)
 
 
 def companions(

@@ -209,10 +209,16 @@ def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequen
             # A resonance that is taken away says nothing of one that is missing elsewhere.
             hinge = "hinge" in h.options
             first, *others = sorted(scores, key=lambda s: (hinge and s.start is None, -s.gain))
-            excess = float(stage.fit.costs[h.joint] - stage.fit.counts[h.joint])
-            ratio = stage.problem.structure.robot.joints[h.joint].gear_ratio if first.gain > RIPPLES * excess else 0.0
-            best.append(replace(first, near=other_waves(first, others, motor_orders(ratio))) if h.repeats else first)
+            near = other_waves(first, others, likely_orders(stage, first)) if h.repeats else ()
+            best.append(replace(first, near=near))
     return best
+
+
+def likely_orders(stage: _Stage, ripple: Score) -> tuple[float, ...]:
+    """``motor_orders`` of the joint of a ripple that explains most of what is left there."""
+    j = ripple.hypothesis.joint
+    excess = stage.fit.costs[j] - stage.fit.counts[j]
+    return motor_orders(stage.problem.structure.robot.joints[j].gear_ratio) if ripple.gain > RIPPLES * excess else ()
 
 
 def other_waves(best: Score, others: Sequence[Score], orders: Sequence[float] = ()) -> tuple[Score, ...]:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.hypotheses.filters import lag, of_step
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
+from ident.hypotheses.filters import STEPPED, lag
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale, sought
 from ident.hypotheses.ripple import SECOND, ripple
 from ident.inverse import recorded_share
 from ident.motion import Motion
@@ -70,7 +70,7 @@ def torque_lag(joint: int, place: str, stepped: bool = True) -> Hypothesis:
             lambda c: np.array([c[0], *none]) if c[0] > 0 else None,
         )
 
-    step, none = of_step(stepped)
+    step, none = sought(STEPPED, stepped)
     return Hypothesis(
         "torque_lag",
         place,

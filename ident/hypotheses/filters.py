@@ -12,11 +12,6 @@ from ident.hypotheses.hypothesis import Parameter
 STEPPED = Parameter("stepped", "1", -0.5, 0.5, nuisance=True, center=0.0, spread=0.15, null=0.0)
 
 
-def of_step(stepped: bool) -> tuple[tuple[Parameter, ...], tuple[float, ...]]:
-    """The parameter by which a lag may come later or sooner, and its value where it does not."""
-    return ((STEPPED,), (0.0,)) if stepped else ((), ())
-
-
 def lag(p: Sequence[float], s: np.ndarray) -> np.ndarray:
     """What comes before a lag over what comes after: ``(1 + s T) exp(s T stepped)`` of a time constant ``T``, s."""
     return (1.0 + s * p[0]) * np.exp(s * p[0] * sum(p[1:]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.group import Group
 from ident.hypotheses.drifts import CHANGE, TIME_CONSTANT, first_change, time_constants, warmth
-from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale
+from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale, sought
 from ident.hypotheses.kernels import smooth_sign
 from ident.hypotheses.yielding import DAHL, bristle
 from ident.motion import Motion
@@ -162,11 +162,6 @@ def turns(scale: SignalScale) -> list[tuple[float]]:
     return [(f * scale.v,) for f in (1e-5, 2e-3, 0.05)]
 
 
-def of_lead(leads: bool) -> tuple[tuple[Parameter, ...], tuple[float, ...]]:
-    """The parameter by which a friction may turn before the velocity does, and its value where it does not."""
-    return ((LEAD,), (0.0,)) if leads else ((), ())
-
-
 def coulomb_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """``torque (sign v + asymmetry)`` (effects.md).
 
@@ -174,7 +169,7 @@ def coulomb_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
         leads: whether it may turn before the velocity does, of this and the others. Motions below the modes of the
             links do not show it.
     """
-    lead, none = of_lead(leads)
+    lead, none = sought(LEAD, leads)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         return dry(motion, j, p[2], p[0] * (1.0 + p[1]), p[0] * (1.0 - p[1]), *p[3:])
@@ -224,7 +219,7 @@ def _first_sizes(c: np.ndarray) -> tuple[float, float] | None:
 def stribeck_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """``sign v (coulomb + (static - coulomb) exp(-|v / v_s|^exponent))``: the exponent is 2, or 1, or between
     (Armstrong-Helouvry 1991)."""
-    lead, none = of_lead(leads)
+    lead, none = sought(LEAD, leads)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         return dry(motion, j, p[3], _dipping(motion.v(j), p), None, *p[5:])
@@ -337,8 +332,7 @@ def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothes
     Args:
         damped: whether that damping is sought. Motions below the modes of the links do not show it.
     """
-    relaxation = (RELAXATION,) if damped else ()
-    undamped = [0.0] * len(relaxation)
+    relaxation, undamped = sought(RELAXATION, damped)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         start = held_at_start(motion, j, p[1])
@@ -389,7 +383,7 @@ def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothes
 
 def load_dependent_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """``coefficient |tau_s| sign v`` (Bittencourt and Gunnarsson 2012)."""
-    lead, none = of_lead(leads)
+    lead, none = sought(LEAD, leads)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         unit = np.abs(motion.tau_s(j)) * sense(motion, j, shape[0])
@@ -415,7 +409,7 @@ def friction_drift(joint: int, place: str, leads: bool = True) -> Hypothesis:
 
     Viscous and Coulomb friction change alike; ``relative_change`` is negative where they fall.
     """
-    lead, none = of_lead(leads)
+    lead, none = sought(LEAD, leads)
 
     def warming(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray]:
         return motion.par.viscous[j] * motion.v(j), warmth(motion, tau)

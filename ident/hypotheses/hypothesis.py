@@ -82,6 +82,12 @@ class Parameter:
         return max(abs(value), 1e-300)
 
 
+def sought(parameter: Parameter, asked: bool) -> tuple[tuple[Parameter, ...], tuple[float, ...]]:
+    """A parameter that is fitted where it is ``asked`` for, and its value where it is as good as absent; nothing of
+    either elsewhere."""
+    return ((parameter,), (parameter.null,)) if asked else ((), ())
+
+
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
 START = Parameter("start", "1", -1.0, 1.0, nuisance=True, step=0.02, center=0.0, spread=0.5, null=0.0, at_start=True)
 EXPONENT = Parameter("exponent", "1", 0.5, SLIP, True, nuisance=True, step=0.05, center=1.0, spread=1.5, reported=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ident.hypotheses import kernels
-from ident.hypotheses.friction import SMOOTHING, SOFT, ahead, direction, of_lead
-from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen
+from ident.hypotheses.friction import LEAD, SMOOTHING, SOFT, ahead, direction
+from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen, sought
 from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
 
@@ -54,7 +54,7 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False)
         yields: whether the friction turns over with the path, as of cables that give before they slip (Dahl 1968), in
             place of the velocity.
     """
-    lead, _ = of_lead(leads)
+    lead, _ = sought(LEAD, leads)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v, q = ahead(motion.v_link(j), motion.time_step, sum(shape)), motion.q_link(j)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ident.hypotheses.drive import SCALE, scale_of
-from ident.hypotheses.filters import lag, of_step
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.hypotheses.filters import STEPPED, lag
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, sought
 from ident.motion import Motion
 
 TRUE_STEPS = 4  # from a measured position to the one at which its error is that of the encoder
@@ -49,7 +49,7 @@ def sensor_lag(joint: int, place: str, stepped: bool = True) -> Hypothesis:
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         return (lag(p, 1j * motion.group.omega) - 1.0) * motion.solution.Q[..., j]
 
-    step, none = of_step(stepped)
+    step, none = sought(STEPPED, stepped)
     return Hypothesis(
         "sensor_lag",
         place,
