@@ -71,6 +71,12 @@ class Attribution:
         """Share of the discrepancy (excess over noise) that no cause explains."""
         return left_share(self.baseline, self.final)
 
+    @property
+    def nameless(self) -> Round | None:
+        """The last round if a law without a name has won it."""
+        best = self.rounds[-1].candidates[0].hypothesis if self.rounds else None
+        return self.rounds[-1] if best and best.decoy and not best.options.get("baseline") else None
+
 
 @dataclass(frozen=True)
 class Task:

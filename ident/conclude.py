@@ -20,7 +20,7 @@ from ident.next_experiment import NextExperiment, advice
 from ident.noise import drifting
 from ident.problem import Problem
 from ident.quantization import Steps
-from ident.reporting import describe, where
+from ident.reporting import where
 from ident.rigid import RigidFit
 from ident.tones import Tone
 from ident.torque_fit import Fit
@@ -77,6 +77,7 @@ def conclude(
     rigid: RigidFit | None = None,
     belied: Collection[tuple[str, str]] = (),
     tones: Sequence[Tone] = (),
+    leftover: str = "",
 ) -> Verdict:
     """Put the result into the words and numbers of verdict.json.
 
@@ -84,6 +85,7 @@ def conclude(
         baseline: the first model, and ``first`` what it predicts.
         belied: causes, by ``key``, that held-out data deny (``trust.denied``).
         tones: what does not repeat with the period. Where nothing else is found it is an unknown cause.
+        leftover: where and how what is left over sits (``leftover.find_leftover``).
         rigid: inertias of the links where they were found too: ``result`` is then about the model with them.
     """
     final = result.final
@@ -137,7 +139,7 @@ def conclude(
     others = extended_baseline(final, covariance) | ({} if rigid is None else inertia_values(rigid))
     values |= others
     undetermined += tuple(k for k, v in others.items() if not v.std < UNDETERMINED * abs(v.value))
-    description = describe(problem, final, last) if unknown and not alone else None
+    description = leftover + nameless_law(result, problem.structure) if unknown and not alone else None
     return Verdict(
         dataset=dataset.name,
         baseline=values,
@@ -195,6 +197,15 @@ def inertia_values(rigid: RigidFit) -> dict[str, Value]:
             name = f"{kind}.{body}"
             out[name] = Value(float(v), float(s), parameter_unit(name))
     return out
+
+
+def nameless_law(result: Attribution, structure: Structure) -> str:
+    """A sentence on the law without a name that came closest to what no cause explains; empty where none did."""
+    if result.nameless is None:
+        return ""
+    law = nameless_note(result.nameless.candidates[0].fit.model.effects[-1], structure)
+    share = result.nameless.explained
+    return f" A law that has no name here explains {share:.0%} of what the named ones leave: {law[:1].lower()}{law[1:]}"
 
 
 def nameless_note(effect: Effect, structure: Structure) -> str:

@@ -28,6 +28,7 @@ from ident.identification import (
     with_noise_of_fast_lines,
 )
 from ident.left_out import SEED, errors_on_parts, joined, refitted
+from ident.leftover import find_leftover
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
 from ident.next_experiment import separating_experiment
@@ -136,8 +137,22 @@ def diagnose_fully(
     separating = separating_experiment(problem, result)
     belied = {r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)}
     tones = tones_of(recorded, last)
+    left = find_leftover(problem, result.final, result.nameless)
     verdict = conclude(
-        dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied, tones
+        dataset,
+        problem,
+        setup.steps,
+        baseline,
+        result,
+        gain,
+        first,
+        last,
+        late,
+        separating,
+        rigid,
+        belied,
+        tones,
+        left.text,
     )
     if setup.ran_away:
         names = ", ".join(setup.ran_away)
@@ -162,9 +177,12 @@ def diagnose_fully(
         joints=dataset.joints,
         frf=frf_views(dataset, problem, first, last),
         spectrum=spectrum_map(problem, baseline, first, last),
-        evidence=tuple(
-            evidence_plot(problem, result.final, last, effect, i)
-            for i, effect in enumerate(named_effects(result.final))
+        evidence=(
+            *(
+                evidence_plot(problem, result.final, last, effect, i)
+                for i, effect in enumerate(named_effects(result.final))
+            ),
+            *([left.plot] if verdict.residual_description else []),
         ),
         traces=torque_traces(shown, pairs),
         parameters={k: v.value for k, v in verdict.baseline.items()},

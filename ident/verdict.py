@@ -188,9 +188,12 @@ class SpectrumMap:
 
 @dataclass(frozen=True)
 class EvidencePlot:
-    """Residual torque, or that of a link encoder, against the variable that explains it, and the fitted law."""
+    """Residual torque, or that of a link encoder, against the variable that explains it, and the fitted law.
 
-    cause: int
+    Of what no cause explains (``cause`` None) the mean of the residual over the variable stands for the law.
+    """
+
+    cause: int | None
     title: str
     x_label: str
     y_label: str

@@ -78,7 +78,8 @@ def test_an_effect_outside_the_catalogue_gets_no_name(ur10, tmp_path, power, coe
     assert verdict.discrepancy.detected
     assert verdict.unexplained_verdict == "unknown cause remains"
     assert all(c.probability <= 0.5 for c in verdict.causes)
-    assert "elbow_joint" in verdict.residual_description
+    assert "mostly at elbow_joint" in verdict.residual_description
+    assert "motor velocity explains" in verdict.residual_description
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from ident.plan_file import plan_from_toml
 from ident.show.export import build_mjcf
 from ident.show.figures import rounded, trace_figure
 from ident.show.outputs import write_outputs
+from ident.show.report import write_report
 from ident.verdict import (
     Cause,
     Diagnosis,
@@ -269,6 +270,17 @@ def diagnosis(ur10):
     f = np.geomspace(1, 70, 40)
     views = tuple(FrfView(f"op0{i}", f, *(rng.random((40, 6, 6)) + 0.1 for _ in range(4))) for i in (1, 2))
     return Diagnosis(verdict, ur10, ur10.joint_names, views, spectrum, (plot,), (trace,), parameters(ur10), 1.0)
+
+
+def test_the_report_shows_what_is_left_over(diagnosis, tmp_path):
+    (plot,) = diagnosis.evidence
+    verdict = replace(diagnosis.verdict, residual_description="The residual torque sits mostly at elbow_joint.")
+    left = replace(diagnosis, verdict=verdict, evidence=(plot, replace(plot, cause=None)))
+    for shown, told in ((diagnosis, 0), (left, 1)):
+        write_report(shown, tmp_path / "report.html")
+        html = (tmp_path / "report.html").read_text(encoding="utf-8")
+        assert html.count("What is left over") == html.count("sits mostly at elbow_joint.") == told
+        assert html.count("residual without the cause") == 1 and html.count("law that explains most of it") == told
 
 
 @pytest.mark.slow

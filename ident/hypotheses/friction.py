@@ -480,7 +480,7 @@ def velocity_power(joint: int, place: str, power: int) -> Hypothesis:
         lambda p, motion, j, k: p[0] * unit(motion, j),
         lambda scale: [()],
         lambda motion, j, k, shape: Screen((unit(motion, j),), lambda c: np.array([c[0]]), ()),
-        "The residual torque of {joint} grows with a power of its velocity.",
+        f"The residual torque of {{joint}} grows with its velocity to the power {power}.",
     )
 
 

@@ -205,12 +205,14 @@ def where_figure(spectrum: SpectrumMap, joints: tuple[str, ...], unit: str) -> s
 
 def evidence_figure(plot: EvidencePlot) -> str:
     """Residual torque against the variable that explains it."""
+    unknown = plot.cause is None
+    residual, law = (
+        ("residual", "law that explains most of it") if unknown else ("residual without the cause", "fitted effect")
+    )
     with mpl.rc_context(STYLE):
         fig, ax = _subplots(figsize=(5.2, 3.3), layout="constrained")
-        ax.plot(
-            *_thin(plot.x, plot.y), ".", ms=2.2, mew=0, alpha=0.45, color=MEASURED, label="residual without the cause"
-        )
-        ax.plot(*_thin(plot.model_x, plot.model_y), ".", ms=2.2, mew=0, alpha=0.7, color=AFTER, label="fitted effect")
+        ax.plot(*_thin(plot.x, plot.y), ".", ms=2.2, mew=0, alpha=0.45, color=MEASURED, label=residual)
+        ax.plot(*_thin(plot.model_x, plot.model_y), ".", ms=2.2, mew=0, alpha=0.7, color=AFTER, label=law)
         ax.set_xlabel(plot.x_label)
         ax.set_ylabel(plot.y_label)
         _legend(fig, ax)
