@@ -15,7 +15,7 @@ from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import Hypothesis
 from ident.inverse import REMAINDER_STEPS, Plane, Sampling, make_plane, plane_at, solve, true_position
 from ident.model import Effect, Model, has_loop, is_along_record, is_dry, joints_along_record
-from ident.motion import Motion, Solution, Torques
+from ident.motion import Motion, Recorded, Solution, Torques
 from ident.reactions import inner_torques, motor_torques
 
 REACTION_STEPS = 8  # passes at most until torques and the motion that they cause agree
@@ -214,13 +214,13 @@ def delivered(effects: Sequence[Effect], group: Group, plane: Plane) -> np.ndarr
     """
     if group.rest is None or not np.any(group.rest):
         return None
-    U, motion = group.U / plane.record[:, None], Motion(group, None, None)
+    U, recorded = group.U / plane.record[:, None], Recorded(group)
     for effect in effects[::-1]:
         h, j = effect.hypothesis, effect.hypothesis.joint
         if "filter" in h.options:
             U[..., j] /= h.options["filter"](effect.p, plane.s)
         else:
-            U[..., j] -= h.law(effect.p, motion, j, 0.0, np.zeros_like(U[..., j]))
+            U[..., j] -= h.law(effect.p, recorded, j, 0.0, np.zeros_like(U[..., j]))
     return U
 
 
@@ -230,7 +230,7 @@ def _added_stiffness(par: Parameters, motion: Motion, effects: Sequence[Effect])
     for effect in effects:
         if effect.hypothesis.gear_law:
             j = effect.hypothesis.joint
-            law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
+            law: kernels.Law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
             out[j] += np.mean(kernels.mean_slope(law, motion.delta(j)))
     return out
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def loop_noise(pred: Prediction, group: Group) -> np.ndarray | None:
     positions = (draws[:, 0] + 1j * draws[:, 1]) * np.sqrt(0.5 * group.position_noise)
     arm = simulated_laws(pred.model)
     arm = replace(arm, effects=tuple(e for e in arm.effects if e.hypothesis.channel not in ("motor", "drive")))
-    held = {"W": pred.solution.W, "steps": 0, "torques": pred.solution.torques}
+    held: dict[str, Any] = {"W": pred.solution.W, "steps": 0, "torques": pred.solution.torques}
     at_hand = arm, pred.structure, pred.par, pred.plane
     moved = [predict_at(*at_hand, replace(group, Q=group.Q + x), pred.sampling, **held).solution for x in positions]
     out = np.zeros((*pred.U.shape[1:], pred.U.shape[2]), complex)
@@ -65,7 +66,7 @@ def loop_noise(pred: Prediction, group: Group) -> np.ndarray | None:
         here = [e for e in loops if (e.hypothesis.joint, e.hypothesis.channel) == place]
         at = _place_of(here, pred, pred.solution)
         x = group.to_time(at.motion[..., None])[..., 0]
-        slopes = sum(kernels.mean_slope(law, x) for law in at.laws)
+        slopes = sum((kernels.mean_slope(law, x) for law in at.laws), np.zeros(len(x)))
         slope, softened = slopes.mean(), np.ones_like(at.compliance)
         softened[1:] = 1.0 / (1.0 + at.compliance[1:] * slope)  # the mean has no noise
         free = at.motion + at.compliance * at.torque
@@ -95,7 +96,7 @@ def record_noise(pred: Prediction, group: Group) -> np.ndarray | None:
         return None
     rng = np.random.default_rng(0)
     # Taken off before the mean over lines, and put back: the gain of a gear is sharp at its resonance.
-    passed = np.ones(pred.U.shape[1:])
+    passed: np.ndarray = np.ones(pred.U.shape[1:])
     for j in joints:
         passed[:, j] = np.maximum(np.abs(pred.plane.spring_gain[:, j, j]), LEAST_GAIN)
     more = np.zeros((*passed.shape, passed.shape[1]), complex)
@@ -137,19 +138,17 @@ def _place_of(effects: Sequence[Effect], pred: Prediction, solution: Solution) -
     plane, h, j = pred.plane, effects[0].hypothesis, effects[0].hypothesis.joint
     c, gear = pred.structure.driven[j], h.channel != "link"
     compliance, moved = plane.A_inv[:, c, c], motion_per_position(pred.structure, pred.par, plane, j, gear=gear)
+    torques = solution.torques.spring if gear else solution.torques.link
+    assert isinstance(torques, np.ndarray)  # there are laws
     if gear:
         laws = tuple(e.hypothesis.law(e.p, None, pred.par.stiffness[j]) for e in effects)
-        return _Place(
-            laws, solution.delta[..., j], solution.torques.spring[..., j], compliance, moved, plane.spring_gain[:, :, j]
-        )
+        return _Place(laws, solution.delta[..., j], torques[..., j], compliance, moved, plane.spring_gain[:, :, j])
     laws = tuple(e.hypothesis.options["loop"](e.p) for e in effects)
-    return _Place(
-        laws, solution.Q_driven[..., j], solution.torques.link[..., c], compliance, moved, plane.link_gain[:, :, c]
-    )
+    return _Place(laws, solution.Q_driven[..., j], torques[..., c], compliance, moved, plane.link_gain[:, :, c])
 
 
 def _along(laws: Sequence[kernels.Law], group: Group, motion: np.ndarray) -> np.ndarray:
     """Spectrum (S, L) of the torque of laws along a motion (S, L) as it is."""
     x, rate, bend = (group.to_time((s * motion)[..., None])[..., 0] for s in (1.0, 1j * group.omega, -(group.omega**2)))
-    torque = sum(kernels.along_motion(law, x, rate + law.lead * bend) for law in laws)
+    torque = sum((kernels.along_motion(law, x, rate + law.lead * bend) for law in laws), np.zeros_like(x))
     return group.to_lines(torque[..., None])[..., 0]

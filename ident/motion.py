@@ -40,7 +40,52 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class Motion:
+class Recorded:
+    """Time signals of records alone, for drives that are asked before a solution is known; each (S, T) on the group's
+    grid."""
+
+    group: Group
+
+    def torque(self, joint: int) -> np.ndarray:
+        """Recorded motor torque without lines of noise alone, N m."""
+        return self._time(self.group.U, joint, share=self.group.torque_share[..., joint])
+
+    def peak_torque(self, joint: int) -> float:
+        """Largest recorded motor torque, N m."""
+        return float(np.max(self.torque_sizes(joint)))
+
+    def usual_torque(self, joint: int) -> float:
+        """Recorded motor torque that is exceeded half of the time, N m."""
+        return float(np.median(self.torque_sizes(joint)))
+
+    def torque_sizes(self, joint: int) -> np.ndarray:
+        """Sizes of the recorded motor torque, N m; the return that closes a motion was not recorded."""
+        u = np.abs(self.torque(joint))
+        return u if self.group.window is None else u[:, self.group.window > 0.0]
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time since the start of the recording, s."""
+        T = self.group.n_time
+        return self.group.start[:, None] + np.arange(T) * self.group.period_time / T
+
+    @property
+    def time_step(self) -> float:
+        """Step of the grid, s."""
+        return self.group.period_time / self.group.n_time
+
+    def lines(self, x: np.ndarray) -> np.ndarray:
+        """Time signal (S, T) to spectrum (S, L)."""
+        return self.group.to_lines(x[..., None])[..., 0]
+
+    def _time(self, X: np.ndarray, column: int, order: int = 0, share: np.ndarray | float = 1.0) -> np.ndarray:
+        x = share * X[..., column]
+        x = x * (1j * self.group.omega) ** order if order else x
+        return self.group.to_time(x[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class Motion(Recorded):
     """Time signals of a solution, made where they are first asked for; each (S, T) on the group's grid, not to be
     written to.
 
@@ -49,7 +94,6 @@ class Motion:
     where None. ``told``: joints at which the record says another torque already, and none of a friction at rest.
     """
 
-    group: Group
     solution: Solution
     par: Parameters
     beside: np.ndarray | float = 0.0
@@ -61,7 +105,7 @@ class Motion:
     def kept(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
         """A signal (S, T) of the solution, which is made once: laws ask for it again with every step of their
         parameters."""
-        if self.solution is None or isinstance(self.error, np.ndarray):
+        if isinstance(self.error, np.ndarray):
             return make()
         signals = self.solution.signals
         if key not in signals:
@@ -101,23 +145,6 @@ class Motion:
         """Its velocity, rad/s."""
         return self.kept(("v_link", joint), lambda: self._time(self.solution.Q_driven, joint, 1))
 
-    def torque(self, joint: int) -> np.ndarray:
-        """Recorded motor torque without lines of noise alone, N m."""
-        return self._time(self.group.U, joint, share=self.group.torque_share[..., joint])
-
-    def peak_torque(self, joint: int) -> float:
-        """Largest recorded motor torque, N m."""
-        return float(np.max(self.torque_sizes(joint)))
-
-    def usual_torque(self, joint: int) -> float:
-        """Recorded motor torque that is exceeded half of the time, N m."""
-        return float(np.median(self.torque_sizes(joint)))
-
-    def torque_sizes(self, joint: int) -> np.ndarray:
-        """Sizes of the recorded motor torque, N m; the return that closes a motion was not recorded."""
-        u = np.abs(self.torque(joint))
-        return u if self.group.window is None else u[:, self.group.window > 0.0]
-
     def asked(self, joint: int) -> np.ndarray:
         """Torque that the record leaves to a friction of the motor, N m."""
         if joint not in self.asked_of:
@@ -146,28 +173,8 @@ class Motion:
         gain = np.abs(s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) ** 2
         return (gain * group.white_noise[joint] + group.white_torque_noise[joint]) * np.mean(1.0 / group.periods)
 
-    @property
-    def time(self) -> np.ndarray:
-        """Time since the start of the recording, s."""
-        T = self.group.n_time
-        return self.group.start[:, None] + np.arange(T) * self.group.period_time / T
-
-    @property
-    def time_step(self) -> float:
-        """Step of the grid, s."""
-        return self.group.period_time / self.group.n_time
-
-    def lines(self, x: np.ndarray) -> np.ndarray:
-        """Time signal (S, T) to spectrum (S, L)."""
-        return self.group.to_lines(x[..., None])[..., 0]
-
     def _shown(self, joint: int, order: int) -> np.ndarray:
         x = self.group.signal_share[..., joint] * self.solution.Q[..., joint]
         if isinstance(self.error, np.ndarray):
             x = x + self.error[..., joint]
         return self._time(x[..., None], 0, order)
-
-    def _time(self, X: np.ndarray, column: int, order: int = 0, share: np.ndarray | float = 1.0) -> np.ndarray:
-        x = share * X[..., column]
-        x = x * (1j * self.group.omega) ** order if order else x
-        return self.group.to_time(x[..., None])[..., 0]

@@ -80,7 +80,7 @@ def inner_torques(
             )
         else:
             others = at_gear.get(j, 0.0)
-            law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
+            law: kernels.Law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
             if j in along and is_along_record(effect.hypothesis):
                 said, left = _along_record(law, par, plane, group, motion, j, c, others, motor + at_motors)
                 at_gear[j] = others + said

@@ -103,7 +103,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
 
 def _turned(axes: np.ndarray) -> list[tuple[tuple[float, float, float], ...]]:
     """Each of the axes first, the others behind it."""
-    rows = [tuple(float(v) for v in a) for a in axes]
+    rows = [(float(x), float(y), float(z)) for x, y, z in axes]
     return [tuple(rows[i:] + rows[:i]) for i in range(len(rows))]
 
 

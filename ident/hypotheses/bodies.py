@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from ident.chain import LinkChange, Structure, build_structure
 from ident.group import Group
-from ident.hypotheses.hypothesis import Hypothesis, Parameter
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, no_law
 from ident.hypotheses.structure import Change, torques_of_changes
 from ident.inverse import Plane
 from ident.motion import Solution
@@ -55,7 +55,7 @@ def payload(link: str) -> Hypothesis:
             Parameter("com_z", "m", -FARTHEST, FARTHEST, step=1e-3, center=0.0, spread=0.2, null=0.0),
             *(Parameter(f"inertia_{i}", "kg m2", 1e-9, 1e4, log=True, step=1e-1) for i in "xyz"),
         ),
-        None,
+        no_law,
         lambda scale: [()],
         None,
         "An unknown load of {mass:.3g} kg hangs at the flange: anti-resonances fall at every posture and the gravity"
@@ -125,7 +125,7 @@ def link_inertia(link: str, joint_index: int, carries_load: bool = False, with_l
         joint_index,
         "model",
         parameters,
-        None,
+        no_law,
         lambda scale: [()],
         None,
         f"The body of {{joint}}{', with the load on it,' if with_load else ''} is not that of the model:"

@@ -6,7 +6,7 @@ import numpy as np
 
 from ident.hypotheses.drive import SCALE, in_time, over_gain, scale_of
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
-from ident.motion import Motion
+from ident.motion import Motion, Recorded
 
 CHANGE = Parameter("relative_change", "1", -0.98, 5.0, step=1e-3, center=0.0, spread=0.5, null=0.0)
 TIME_CONSTANT = Parameter("time_constant", "s", 1.0, 1e5, log=True, step=1e-2)
@@ -14,7 +14,7 @@ PLAIN = 3.0  # time constant over the least one, below which a drift is over bef
 BEGUN = (0.1, 0.3, 1.0)  # of the recording, time constants from which a drift is begun
 
 
-def warmth(motion: Motion, time_constant: float) -> np.ndarray:
+def warmth(motion: Recorded, time_constant: float) -> np.ndarray:
     """How far a machine has warmed up since the recording began, 0 to 1; (S, T)."""
     return 1.0 - np.exp(-motion.time / time_constant)
 
@@ -35,7 +35,7 @@ def torque_drift(joint: int, place: str) -> Hypothesis:
     Delivered torque is ``scale (1 + relative_change (1 - exp(-t / time_constant)))`` times the recorded one.
     """
 
-    def asked(p, motion: Motion, j: int, k: float, U: np.ndarray) -> np.ndarray:
+    def asked(p, motion: Recorded, j: int, k: float, U: np.ndarray) -> np.ndarray:
         scale, change, tau = p
         return over_gain(U, scale * (1.0 + change * warmth(motion, tau)), motion)
 

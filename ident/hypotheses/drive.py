@@ -10,7 +10,7 @@ from ident.hypotheses.filters import STEPPED, lag
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale, sought
 from ident.hypotheses.ripple import SECOND, ripple
 from ident.inverse import recorded_share
-from ident.motion import Motion
+from ident.motion import Motion, Recorded
 
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
 SCALE = Parameter("scale", "1", 0.2, 5.0, log=True)  # delivered torque over the recorded one
@@ -23,13 +23,13 @@ def scale_of(weight: float) -> float:
     return 1.0 / (1.0 + np.clip(weight, -0.8, 4.0))
 
 
-def over_gain(U: np.ndarray, gain: np.ndarray, motion: Motion) -> np.ndarray:
+def over_gain(U: np.ndarray, gain: np.ndarray, motion: Recorded) -> np.ndarray:
     """Recorded torque (..., L) of which a motor delivers ``U`` (..., L), by a gain (S, T) that changes along the
     record."""
     return U + motion.lines((1.0 / gain - 1.0) * in_time(U, motion))
 
 
-def in_time(U: np.ndarray, motion: Motion) -> np.ndarray:
+def in_time(U: np.ndarray, motion: Recorded) -> np.ndarray:
     """A spectrum (..., L) of one joint on the grid of time, (..., T)."""
     return motion.group.to_time(U[..., None])[..., 0]
 
@@ -152,13 +152,13 @@ def torque_saturation(joint: int, place: str, wound_up: bool = False) -> Hypothe
             recorded, and for half of a motion, at most.
     """
 
-    def excess(limit: float, knee: float, motion: Motion, j: int) -> np.ndarray:
+    def excess(limit: float, knee: float, motion: Recorded, j: int) -> np.ndarray:
         u = motion.torque(j)
         limit = max(limit, motion.usual_torque(j) if wound_up else LEAST_LIMIT * motion.peak_torque(j))
         over = np.log(np.maximum(np.abs(u), 1e-12 * limit) / limit) / knee
         return u * (1.0 - np.exp(-knee * np.logaddexp(0.0, over)))
 
-    def shapes(scale: SignalScale) -> list[tuple[float, float]]:
+    def shapes(scale: SignalScale) -> list[tuple[float, ...]]:
         if not wound_up:
             # Torque that is fast against the compared band meets a limit that its slow part stays below.
             return [(f * scale.peak_torque, KNEE.center) for f in (0.5, 0.65, 0.8, 0.9, 0.96, 1.0, 1.03)]
@@ -171,10 +171,10 @@ def torque_saturation(joint: int, place: str, wound_up: bool = False) -> Hypothe
         joint,
         "drive",
         (Parameter("limit", "N m", 1e-6, 1e8, log=True, step=1e-3), KNEE),
-        lambda p, motion, j, k, U: U + motion.lines(excess(*p, motion, j)),
+        lambda p, motion, j, k, U: U + motion.lines(excess(p[0], p[1], motion, j)),
         shapes,
         lambda motion, j, k, shape: Screen(
-            (excess(*shape, motion, j),), lambda c: np.array(shape) if c[0] > 0.2 else None, shape
+            (excess(shape[0], shape[1], motion, j),), lambda c: np.array(shape) if c[0] > 0.2 else None, shape
         ),
         "The motor of {joint} delivers no more than {limit:.4g} N m: the residual torque sits at the peaks.",
         variable="torque",
@@ -189,7 +189,7 @@ def torque_curve(joint: int, place: str) -> Hypothesis:
     It falls short at every torque, where one that is clipped does at its peaks alone.
     """
 
-    def excess(p, motion: Motion, j: int) -> np.ndarray:
+    def excess(p, motion: Recorded, j: int) -> np.ndarray:
         u, reach = motion.torque(j), max(p[0], motion.peak_torque(j))
         return u - reach * np.tanh(u / reach)
 

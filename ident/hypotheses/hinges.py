@@ -9,7 +9,7 @@ import numpy as np
 from ident.chain import Structure, build_structure
 from ident.graybox import equilibrium, linearise
 from ident.group import Group
-from ident.hypotheses.hypothesis import Hypothesis, Parameter
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, no_law
 from ident.hypotheses.structure import Change, apply_change
 from ident.inverse import plane_at
 from robot_assets.robot import Elasticity
@@ -78,7 +78,7 @@ def compliance(
             Parameter("damping", "N m s/rad", 1e-6, 1e9, log=True, step=1e-2),
             *(Parameter(t, "1", -MOST_TILT, MOST_TILT, nuisance=True, step=1e-3, spread=1.0, null=0.0) for t in tilts),
         ),
-        None,
+        no_law,
         lambda scale: [(f * scale.highest_line, 0.03) for f in RESONANCES],
         None,
         f"The data hold a resonance that the model lacks: {{joint}} bends across its axis, {where}, with"

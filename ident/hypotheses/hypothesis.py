@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -85,7 +86,10 @@ class Parameter:
 def sought(parameter: Parameter, asked: bool) -> tuple[tuple[Parameter, ...], tuple[float, ...]]:
     """A parameter that is fitted where it is ``asked`` for, and its value where it is as good as absent; nothing of
     either elsewhere."""
-    return ((parameter,), (parameter.null,)) if asked else ((), ())
+    if not asked:
+        return (), ()
+    assert parameter.null is not None
+    return (parameter,), (parameter.null,)
 
 
 RIPPLE = "periods_per_rev"  # parameter of effects that repeat with the position
@@ -111,6 +115,11 @@ class Screen:
     motor: tuple[np.ndarray, ...] = ()
 
 
+def no_law(*_: object) -> NoReturn:
+    """In place of the law of an effect that has none: it changes the chain, or is solved in a loop alone."""
+    raise TypeError("an effect without a law")
+
+
 @dataclass(frozen=True)
 class Hypothesis:
     """An effect of the catalogue (or a decoy outside it) at one place.
@@ -125,7 +134,9 @@ class Hypothesis:
             motor position; "drive" (S, L) recorded torque spectrum from the predicted one;
             "model": the chain itself is changed (see structure.py).
         parameters: in the order of the vector ``p`` of the law.
-        law: (p, motion, joint, stiffness) -> array as the channel says.
+        law: (p, motion, joint, stiffness) -> array as the channel says. A drive is given its torque spectrum too; in
+            parallel with the gear it is (p, None, stiffness) -> ``kernels.Law``, or of a kinematic error (p, motion,
+            joint, stiffness) -> error and torque at the motor. ``no_law`` where there is none.
         screen: motion, joint, stiffness, scale -> unit responses.
         sentence: evidence with {joint} and the parameters as fields.
         options: what single hypotheses need beyond that. ``size(scale)`` gives parameters of a strong effect
@@ -163,8 +174,8 @@ class Hypothesis:
     joint: int
     channel: str
     parameters: tuple[Parameter, ...]
-    law: Callable[..., np.ndarray] | None
-    shapes: Callable[[SignalScale], list[tuple[float, ...]]]
+    law: Callable[..., Any]
+    shapes: Callable[[SignalScale], Sequence[tuple[float, ...]]]
     screen: Callable[[Motion, int, float, tuple[float, ...]], Screen] | None
     sentence: str
     variable: str = "v"

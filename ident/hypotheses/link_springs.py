@@ -6,7 +6,7 @@ import numpy as np
 
 from ident.hypotheses import kernels
 from ident.hypotheses.friction import LEAD, SMOOTHING, SOFT, ahead, direction
-from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen, sought
+from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen, no_law, sought
 from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
 
@@ -84,7 +84,7 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False)
             Parameter("friction", "N m", 1e-9, 1e7, log=True, step=1e-3),
             *own,
         ),
-        None,
+        no_law,
         lambda scale: [(x,) for x in SOFT] if lead and not yields else [()],
         screen,
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
@@ -93,7 +93,7 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False)
             "loop": lambda p: (
                 kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2], start=p[3])
                 if yields
-                else kernels.Law(kernels.LINK, *p[:3], lead=sum(p[3:]))
+                else kernels.Law(kernels.LINK, p[0], p[1], p[2], lead=sum(p[3:]))
             ),
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the
             # motor.

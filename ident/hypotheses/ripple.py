@@ -5,6 +5,8 @@ Slots, teeth and balls of real drives make harmonics; a ripple far above the noi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ident.hypotheses.hypothesis import Parameter
@@ -18,7 +20,7 @@ SECOND = tuple(
 )
 
 
-def ripple(sine: float, cosine: float, second: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ripple(sine: float, cosine: float, second: Sequence[float], angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A ripple and its slope over the angle.
 
     Args:

@@ -77,7 +77,8 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
     """
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        measured, error = motion.q(j), 0.0
+        measured = motion.q(j)
+        error = np.zeros_like(measured)
         for _ in range(TRUE_STEPS):
             q = turns * (measured - error)
             error = p[0] * np.sin(q) + p[1] * np.cos(q)

@@ -13,7 +13,7 @@ import scipy.linalg
 from ident.chain import LinkChange, Structure, build_structure
 from ident.graybox import Parameters
 from ident.group import Group
-from ident.hypotheses.hypothesis import Hypothesis, Parameter
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, no_law
 from ident.inverse import Plane, coarse_group, inverse_dynamics
 from ident.motion import Solution
 from robot_assets.robot import Elasticity
@@ -125,7 +125,7 @@ def leaning_base() -> Hypothesis:
         -1,
         "model",
         tuple(Parameter(f"tilt_{i}", "rad", -1.0, 1.0, step=1e-3, center=0.0, spread=0.1, null=0.0) for i in "12"),
-        None,
+        no_law,
         lambda scale: [()],
         None,
         "Gravity torques are those of a base that leans, which the catalogue has no name for.",
@@ -166,7 +166,7 @@ def joint_coupling(source: int, target: int, place: str, turned: str) -> Hypothe
         source,
         "model",
         (ratio,),
-        None,
+        no_law,
         lambda scale: [()],
         None,
         "Turning the motor of {joint} turns {turned} too, by a ratio of {ratio:.4g}.",
@@ -201,7 +201,7 @@ def link_friction(joint: int, place: str) -> Hypothesis:
         joint,
         "model",
         (Parameter("coefficient", "N m s/rad", 1e-9, 1e7, log=True, step=1e-3),),
-        None,
+        no_law,
         lambda scale: [()],
         None,
         "Viscous friction of {coefficient:.3g} N m s/rad on the link of {joint}, behind its gear, is part of the extended"
