@@ -58,7 +58,7 @@ def by_noise(
         still: of ``held_share``, of each group; of motors that nothing holds where None.
     """
     each = zip(problem.groups, preds, weights.whiten, still or [None] * len(preds), strict=True)
-    return sum(scatter_costs(*of) for of in each)
+    return sum((scatter_costs(*of) for of in each), np.zeros(problem.structure.n))
 
 
 def noise_of(problem: Problem, preds: Sequence[Prediction], weights: Weights, laws: Sequence[np.ndarray]) -> np.ndarray:
@@ -98,8 +98,13 @@ def absorbed(problem: Problem, preds: Sequence[Prediction], weights: Weights) ->
         share, n = held_share(pred, group), problem.structure.n
         if share is None:
             return np.zeros(whiten.shape[1])
-        noise = {"tau_std": problem.tau_std, "q_std": problem.q_std, "samples": problem.samples(group)}
-        S = residual_covariance(group, pred.sampled_impedance, **noise)
+        S = residual_covariance(
+            group,
+            pred.sampled_impedance,
+            tau_std=problem.tau_std,
+            q_std=problem.q_std,
+            samples=problem.samples(group),
+        )
         W = whiten[:, :, :n]
         return record_count(group) * np.einsum("kij,kjl,kil->i", W, S - as_held(S, share), W.conj(), optimize=True).real
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -222,7 +223,8 @@ def _effect_differences(
         base, posture = remade, None
         moved = [_again(problem, m, group, pred, 1) for m in models]
     else:
-        base, held = pred, {"W": pred.solution.W, "torques": pred.solution.torques}
+        base = pred
+        held: dict[str, Any] = {"W": pred.solution.W, "torques": pred.solution.torques}
         moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
     return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]
 
@@ -284,7 +286,7 @@ def normal_equations(
         return J.T @ J, J.T @ r
 
     H, b = zip(*map_threads(of_group, range(len(problem.groups))), strict=True)
-    return sum(H), sum(b)
+    return sum(H, np.zeros_like(H[0])), sum(b, np.zeros_like(b[0]))
 
 
 def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
@@ -305,16 +307,16 @@ def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], we
         K = len(whiten)
         return scatter_slope(group, pred, whiten, _baseline(model, pred, pred.about, K), others(group, pred, K), count)
 
-    return sum(map_threads(of_group, zip(problem.groups, preds, weights.whiten, strict=True)))
+    return sum(map_threads(of_group, zip(problem.groups, preds, weights.whiten, strict=True)), np.zeros(count))
 
 
 def shared_information(problem: Problem, model: Model, preds: Sequence[Prediction], weights: Weights) -> np.ndarray:
     """What noise adds to the normal matrix of the baseline parameters."""
-    each = zip(problem.groups, preds, weights.whiten, strict=True)
-    return sum(
+    each = [
         scatter_information(g, pred, whiten, _baseline(model, pred, pred.about, len(whiten)))
-        for g, pred, whiten in each
-    )
+        for g, pred, whiten in zip(problem.groups, preds, weights.whiten, strict=True)
+    ]
+    return sum(each, np.zeros_like(each[0]))
 
 
 def as_real(X: np.ndarray) -> np.ndarray:

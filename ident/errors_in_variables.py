@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,7 @@ def scatter_costs(group: Group, pred: Prediction, whiten: np.ndarray, still: np.
         whiten: (K, n, n) of the compared lines; still: of ``held_share``.
     """
     Z = pred.sampled_impedance[: len(whiten)]
+    assert group.scatter is not None
     torque, across, position = group.scatter
     mixed = across @ _adjoint(Z)
     covariance = as_held(torque - mixed - _adjoint(mixed) + Z @ position @ _adjoint(Z), still)
@@ -58,6 +60,7 @@ def scatter_slope(
         count: coordinates, p.
     """
     K = len(whiten)
+    assert group.scatter is not None
     _, across, position = group.scatter
     shared = whiten @ (across - pred.sampled_impedance[:K] @ position)  # (K, n, n) whitened residual times position
     out = np.zeros(count)
@@ -72,8 +75,10 @@ def scatter_slope(
 def scatter_information(group: Group, pred: Prediction, whiten: np.ndarray, baseline: Products) -> np.ndarray:
     """What it adds to ``J^H J`` of the coordinates of ``baseline``."""
     K = len(whiten)
+    assert group.scatter is not None
+    _, _, position = group.scatter
     signals = signals_per_position(pred, K)
-    among = (signals @ group.scatter[2] @ _adjoint(signals))[:, baseline.of][:, :, baseline.of]
+    among = (signals @ position @ _adjoint(signals))[:, baseline.of][:, :, baseline.of]
     gains = _whitened_gains(pred, whiten, baseline)
     return np.einsum("kcd,kdc->cd", _adjoint(gains) @ gains, among).real
 
@@ -153,7 +158,7 @@ def impedance_slopes(
     h, K = model.effects[effect].hypothesis, group.n_compared
     if not (is_linear(h) or moves_plane(h)):
         return
-    held = {"W": pred.solution.W, "torques": pred.solution.torques}
+    held: dict[str, Any] = {"W": pred.solution.W, "torques": pred.solution.torques}
     elsewhere = pred.about is not pred.plane and (h.channel == "model" or moves_plane(h))
     for p, step in steps:
         effects = tuple(Effect(h, p) if i == effect else e for i, e in enumerate(model.effects))

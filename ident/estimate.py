@@ -122,8 +122,8 @@ def fit_frf(
     criterion = _Criterion.of(structure, frf, sample_time, hold, estimator)
     # LLS hardly sees weak springs: an end that it likes may be far off by the wanted criterion.
     best = min(ends, key=lambda p: criterion.normal(p, criterion.linearised(p), free)[0]) if len(ends) > 1 else ends[0]
-    for k in range(ROUNDS):
-        provisional = estimator == "wlls" and k == 0
+    for turn in range(ROUNDS):
+        provisional = estimator == "wlls" and turn == 0
         last, result = best.to_log(), _minimise(criterion, best, free, SEARCH if provisional else FINAL)
         best = result.parameters
         if provisional:
@@ -245,6 +245,7 @@ class _Criterion:
         frequency = np.tile(self.frf.frequency, len(self.frf.q0))[part]
         lin = Linearisation(lin.q, lin.M[part], lin.Kg[part], lin.g)
         model, dG = sampled_frf(self.structure, par, lin, frequency, self.sample_time, self.hold, derivatives=True)
+        assert dG is not None  # as asked for
         m = np.swapaxes(model, 1, 2).reshape(g.shape)
         J = np.swapaxes(dG, 1, 2).reshape(*g.shape, -1)
         J[..., -1] *= self.sample_time
@@ -262,7 +263,8 @@ class _Criterion:
 
     def normal(self, par: Parameters, lin: Linearisation, fitted: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Cost, half its gradient and the Gauss-Newton matrix for the fitted of all coordinates."""
-        cost, g, H = 0.0, 0.0, 0.0
+        p = int(fitted.sum())
+        cost, g, H = 0.0, np.zeros(p), np.zeros((p, p))
         for part in self.parts:
             r, J = self.residual(par, lin, part)
             J = J if fitted.all() else np.ascontiguousarray(J[..., fitted])
@@ -275,11 +277,11 @@ class _Criterion:
 
     def scatter(self, par: Parameters) -> np.ndarray:
         """``Re J^H Lambda J``, the spread of the gradient of an unweighted criterion; (p, p)."""
-        lin, B = self.linearised(par), 0.0
+        lin, spreads = self.linearised(par), []
         for part in self.parts:
             _, J = self.residual(par, lin, part)
-            B = B + np.tensordot(J.conj(), self.Lambda[part] @ J, ((0, 1), (0, 1))).real
-        return B
+            spreads.append(np.tensordot(J.conj(), self.Lambda[part] @ J, ((0, 1), (0, 1))).real)
+        return sum(spreads, np.zeros_like(spreads[0]))
 
 
 def _relative(Lambda: np.ndarray, size: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ def position_lines(
     step = 0.7 * np.pi / span
     steps = int(np.clip(max(x.highest() for x in records) / step, *WAVE_STEPS))
     coarse = step * np.arange(1, steps + 1)
-    power = sum(_own_power(x, step, steps) for x in records)
+    power = sum((_own_power(x, step, steps) for x in records), np.zeros(steps))
     total = sum(float(x.residual @ x.residual) for x in records)
     best: list[float] = []
     for k in np.argsort(-power):

@@ -203,8 +203,8 @@ def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequen
     ]
     best = []
     for h in hypotheses:
-        scores = [_score(stage, fields, h, shape) for shape in h.shapes(scales[max(h.joint, 0)])]
-        scores = [s for s in scores if s is not None]
+        tried = [_score(stage, fields, h, shape) for shape in h.shapes(scales[max(h.joint, 0)])]
+        scores = [s for s in tried if s is not None]
         if scores:
             # A resonance that is taken away says nothing of one that is missing elsewhere.
             hinge = "hinge" in h.options
@@ -251,6 +251,7 @@ def _score(stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, sh
             sums = _whole_sums(stage, g, np.stack(units, axis=-1), wound)
         else:
             motion = stage.motions[g]
+            assert h.screen is not None  # beside the chain there is one
             made = h.screen(motion, h.joint, pred.par.stiffness[h.joint], shape)
             start = made.start
             parts = [(h.channel, _lines(motion, made.signals))]
@@ -259,7 +260,8 @@ def _score(stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, sh
             if group.window is None:
                 sums = _line_sums([(fields[g][c], X[:, : group.n_compared]) for c, X in parts])
             else:
-                sums = _whole_sums(stage, g, sum(_along_motion(stage, g, c, h.joint, X) for c, X in parts))
+                along = [_along_motion(stage, g, c, h.joint, X) for c, X in parts]
+                sums = _whole_sums(stage, g, sum(along, np.zeros_like(along[0])))
         total = sums if total is None else total + sums
     if total is None:
         return None
@@ -318,7 +320,8 @@ def _whole_sums(stage: _Stage, g: int, units: np.ndarray, wound: np.ndarray | No
 
 def _line_sums(parts: Sequence[tuple[_Field, np.ndarray]]) -> _Sums:
     """Sums of signals (S, K, m) that act through fields at the same time, line by line."""
-    own, with_residual, with_columns = 0.0, 0.0, 0.0
+    m, p = parts[0][1].shape[-1], parts[0][0].columns.shape[-1]
+    own, with_residual, with_columns = np.zeros((m, m)), np.zeros(m), np.zeros((p, m))
     for field, X in parts:
         flat, mean = X.reshape(-1, X.shape[-1]), X[:, 0].real
         for other, Y in parts:

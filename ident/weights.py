@@ -24,10 +24,11 @@ def make_weights(problem: Problem, predictions: Sequence[Prediction], rho: float
     """
     whiten, covariance = [], []
     known = has_scatter(problem, predictions[0].model)
-    laws = [
-        noise_of_laws(pred, group) if known else None for group, pred in zip(problem.groups, predictions, strict=True)
-    ]
-    for group, pred, of_laws in zip(problem.groups, predictions, laws, strict=True):
+    laws = (
+        [noise_of_laws(pred, group) for group, pred in zip(problem.groups, predictions, strict=True)] if known else []
+    )
+    added: Sequence[np.ndarray | None] = laws if known else [None] * len(predictions)
+    for group, pred, of_laws in zip(problem.groups, predictions, added, strict=True):
         S = output_covariance(problem, group, pred, of_laws)
         k = np.arange(S.shape[1])
         # Offsets that wander are slower than any line, and no scatter of neighbouring lines shows them: the static one is
@@ -76,6 +77,7 @@ def _signals(group: Group, prediction: Prediction) -> np.ndarray:
     show."""
     if not group.links:
         return group.U
+    assert group.Q_link is not None  # of which links are compared
     windup = group.Q_link[..., list(group.links)] - group.Q @ prediction.par.coupling[list(group.links)].T
     windup[:, 0] = 0.0
     return np.concatenate([group.U, windup], axis=-1)
