@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,8 +68,8 @@ class Segment:
         """Samples of the record."""
         return len(self.t)
 
-    def part(self, rows: slice) -> dict[str, np.ndarray]:
-        """Time and the channels that there are, some of their samples."""
+    def part(self, rows: slice) -> dict[str, Any]:
+        """Time and the channels that there are, some of their samples, as arguments of a segment."""
         return {name: x[rows] for name in ("t", *CHANNELS) if (x := getattr(self, name)) is not None}
 
     @property

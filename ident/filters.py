@@ -63,12 +63,10 @@ def stepper(structure: Structure, par: Parameters, noise: Noise, q0: np.ndarray,
     entry = np.zeros((2 * (n + N), N))
     entry[2 * n + N :] = np.eye(N)
     (_, hold), rise = held(space.continuous, entry, sample_time)
-    return Stepper(
-        x0,
-        -W[:n] @ x0,
-        *map(np.ascontiguousarray, (space.A, space.B, hold, rise, W[n:], space.continuous[2 * n + N :])),
-        kalman(space, noise, sample_time),
+    A, B, hold, rise, springs, flat = map(
+        np.ascontiguousarray, (space.A, space.B, hold, rise, W[n:], space.continuous[2 * n + N :])
     )
+    return Stepper(x0, -W[:n] @ x0, A, B, hold, rise, springs, flat, kalman(space, noise, sample_time))
 
 
 def extended_kalman(structure: Structure, runs: Runs) -> Predictor:

@@ -68,7 +68,7 @@ def estimate_frf(
         return estimate_local(dataset, method=estimator, role=role, amplitude=amplitude)
     points, level = choose_segments(dataset, role, amplitude)
     lines = common_lines(points, dataset)
-    periods = [members[0].period for members in points.values()]
+    periods = [int(members[0].period or 0) for members in points.values()]
     first = lines[next(iter(points))]
     frequency, n = first * dataset.sample_rate / periods[0], dataset.n
     blocks = [_blocks(members, lines[name], frequency, n, name) for name, members in points.items()]
@@ -83,7 +83,10 @@ def estimate_frf(
         _unexcited_scatter(members, lines[name], G, dataset) if unsaid and b.U.shape[:2] == (1, 1) else None
         for (name, members), b, G in zip(points.items(), blocks, results, strict=True)
     ]
-    spreads = [_covariance(b, G, kind, *x) for b, G, *x in zip(blocks, results, powers, scatters, strict=True)]
+    spreads = [
+        _covariance(b, G, kind, power, scatter)
+        for b, G, power, scatter in zip(blocks, results, powers, scatters, strict=True)
+    ]
     diag = [tuple(unvec(np.einsum("fii->fi", c).real, n) for c in pair) for pair in spreads]
     return FRF(
         G=np.stack(results),
@@ -108,7 +111,9 @@ def average(blocks: Blocks, estimator: str) -> np.ndarray:
     """One of the five averages over realizations; (F, n, n)."""
     U, Y = blocks.U.mean(axis=1), blocks.Y.mean(axis=1)
     if estimator in ("h1", "jio"):
-        right = np.conj(np.swapaxes(U if estimator == "h1" else blocks.R, -1, -2))
+        against = U if estimator == "h1" else blocks.R
+        assert against is not None  # JIO is refused without a reference
+        right = np.conj(np.swapaxes(against, -1, -2))
         return np.matmul((Y @ right).sum(axis=0), np.linalg.inv((U @ right).sum(axis=0)))
     each = Y @ np.linalg.inv(U)
     if estimator == "ari":
@@ -185,15 +190,16 @@ def _unexcited_scatter(
     if len(free) < NEAREST:
         return None
     period = members[0].period
+    assert period is not None  # of a multisine
     spacing = dataset.sample_rate / period
     flat = G.reshape(len(lines), -1).T
     between = np.stack([np.interp(free, lines, c.real) + 1j * np.interp(free, lines, c.imag) for c in flat], axis=1)
     between = between.reshape(len(free), *G.shape[1:])
-    E = []
+    errors = []
     for s in members:
         U, Q = (np.fft.rfft(s.periodic(c), axis=1, norm="forward")[:, free] for c in ("tau", "q"))
-        E.append(-((2 * np.pi * spacing * free[:, None]) ** 2) * Q - np.einsum("lij,plj->pli", between, U))
-    E = np.concatenate(E)
+        errors.append(-((2 * np.pi * spacing * free[:, None]) ** 2) * Q - np.einsum("lij,plj->pli", between, U))
+    E = np.concatenate(errors)
     shapes = [
         np.sqrt(np.einsum("fii->fi", _sample_noise(H, *sample_noise_power(dataset, period, spacing * k))).real)
         for H, k in ((between, free), (G, lines))
@@ -271,6 +277,8 @@ def _gains(blocks: Blocks, estimator: str) -> np.ndarray:
     """``A_m`` of the error ``sum_m E_m A_m`` of an average; (M, F, n_u, n)."""
     U = blocks.U.mean(axis=1)
     if estimator in ("h1", "jio"):
-        right = np.conj(np.swapaxes(U if estimator == "h1" else blocks.R, -1, -2))
+        against = U if estimator == "h1" else blocks.R
+        assert against is not None  # JIO is refused without a reference
+        right = np.conj(np.swapaxes(against, -1, -2))
         return right @ np.linalg.inv((U @ right).sum(axis=0))
     return np.linalg.inv(U) / len(U)

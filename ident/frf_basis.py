@@ -104,19 +104,22 @@ def common_lines(points: dict[str, list[Segment]], dataset: Dataset) -> dict[str
         DataError: where periods of one point differ or no frequency is shared.
     """
     shared = None
-    for members in points.values():
+    periods: dict[str, int] = {}
+    for name, members in points.items():
         first = members[0]
+        assert first.period is not None  # of a multisine
+        periods[name] = first.period
         lines = np.asarray(first.excited_lines, int)
         for s in members:
             if s.period != first.period:
                 raise DataError("period", s.name, str(s.period), f"{first.period} as in {first.name}")
             lines = np.intersect1d(lines, s.excited_lines)
-        frequencies = {Fraction(int(k), int(first.period)) for k in lines}
+        frequencies = {Fraction(int(k), first.period) for k in lines}
         shared = frequencies if shared is None else shared & frequencies
     if not shared:
         found, wanted = "no frequency that all segments share", "a common grid (`identify --estimator ml` needs none)"
         raise DataError("excited_lines", dataset.name, found, wanted)
-    return {name: np.array([int(f * members[0].period) for f in sorted(shared)]) for name, members in points.items()}
+    return {name: np.array([int(f * period) for f in sorted(shared)]) for name, period in periods.items()}
 
 
 def kron_by_line(K: np.ndarray, Phi: np.ndarray) -> np.ndarray:
@@ -125,7 +128,7 @@ def kron_by_line(K: np.ndarray, Phi: np.ndarray) -> np.ndarray:
     return np.einsum("fjl,fik->fjilk", K, Phi).reshape(F, n * n, n * n)
 
 
-def steadied(Phi: np.ndarray, dof: int, shape: np.ndarray) -> np.ndarray:
+def steadied(Phi: np.ndarray, dof: float, shape: np.ndarray) -> np.ndarray:
     """(F, n, n) sample covariances of few degrees of freedom, steadied over neighbouring lines.
 
     Variances: mean of the logarithms of their ratio to ``shape`` (F, n) over just enough lines,

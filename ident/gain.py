@@ -96,6 +96,7 @@ def line_squares(lines: np.ndarray) -> np.ndarray:
 def stretch_squares(group: Group, lines: np.ndarray, parts: int) -> np.ndarray:
     """Mean squares (parts, n) of a windowed motion from its lines (1, K, n), by stretches of time; their mean is that
     of the whole."""
+    assert group.window is not None
     full = np.zeros((1, len(group.omega), lines.shape[2]), complex)
     full[:, : lines.shape[1]] = lines
     squares = group.to_time(full)[0] ** 2

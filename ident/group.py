@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -92,7 +93,10 @@ class Group:
     @property
     def outputs(self) -> np.ndarray:
         """(S, L, n + M) what is compared: recorded torque, N m, then link positions, rad."""
-        return self.U if not self.links else np.concatenate([self.U, self.Q_link[..., list(self.links)]], axis=-1)
+        if not self.links:
+            return self.U
+        assert self.Q_link is not None  # of which links are compared
+        return np.concatenate([self.U, self.Q_link[..., list(self.links)]], axis=-1)
 
     @cached_property
     def scatter(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -103,9 +107,11 @@ class Group:
         encoders.
         """
         periods = self.U_periods.shape[1]
-        if self.links or (periods < 2 and self.known_noise is None):
+        if self.links:
             return None
         if periods < 2:
+            if self.known_noise is None:
+                return None
             torque, position = (
                 len(self.U) * np.tile(np.diag(x).astype(complex), (self.n_compared, 1, 1)) for x in self.known_noise
             )
@@ -219,14 +225,14 @@ class Group:
             "Q_noise",
         )
         parts = {name: getattr(self, name) for name in names}
-        kept = {name: None if x is None else x[rows] for name, x in parts.items()}
+        kept: dict[str, Any] = {name: None if x is None else x[rows] for name, x in parts.items()}
         return replace(self, segments=tuple(self.segments[i] for i in rows), **kept)
 
     def slow(self) -> Group:
         """The group with the lines of the geometry alone."""
         names = ("U", "Q", "U_periods", "Q_periods", "Q_link")
         parts = {name: getattr(self, name) for name in names}
-        cut = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
+        cut: dict[str, Any] = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
         return replace(
             self,
             omega=self.omega[: self.n_slow],
@@ -282,6 +288,7 @@ class Group:
         """
         flat = X.reshape(*X.shape[:2], -1)
         if self.links:
+            assert self.window is not None  # link encoders are compared along motions
             first = self.U.shape[-1] * flat.shape[-1] // X.shape[2]
             share = self.window**2 / np.sum(self.window**2)
             flat = flat.copy()

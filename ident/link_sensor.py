@@ -100,6 +100,7 @@ def _equations(group: Group, pred: Prediction, j: int, delay: float) -> np.ndarr
 
     (S, K - 1, 4) complex, rad; the mean position is left out.
     """
+    assert group.Q_link is not None  # of which links are compared
     motion, s = pred.motion(), 1j * group.omega
     late = np.exp(-s * delay)
     q_link = late * pred.solution.Q_a[..., pred.structure.driven[j]]
@@ -115,7 +116,7 @@ def _equations(group: Group, pred: Prediction, j: int, delay: float) -> np.ndarr
 def _fit_delay(pairs: Sequence[tuple[Group, Prediction]], j: int) -> tuple[float, float] | None:
     """Delay and standard deviation, s, where it is sure and explains most of what is left without it."""
     delay = 0.0
-    weights = [1.0] * len(pairs)
+    weights: list[np.ndarray | float] = [1.0] * len(pairs)
     for _ in range(PASSES):
         rows = [_equations(group, pred, j, delay) for group, pred in pairs]
         x = _solve(np.concatenate([_stack(r, w) for r, w in zip(rows, weights, strict=True)]), (1, 2, 3))

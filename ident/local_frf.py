@@ -102,6 +102,8 @@ def estimate_local(
             raise DataError("r", s.name, "no reference", "r columns, which local methods need")
     if len({s.period for s in chosen}) > 1:
         raise DataError("period", dataset.name, "several", "one, which local methods need")
+    period = chosen[0].period
+    assert period is not None  # of a multisine
     n, lines = dataset.n, common_lines(points, dataset)[next(iter(points))]
     poles = poles if method == "lrm" else 0
     E = min(len(members) for members in points.values())
@@ -114,11 +116,11 @@ def estimate_local(
     step = stride or max(1, width // (order + 1))
     centres = np.arange(half % step, len(lines), step)
     results = [
-        [_fit(_window(spectra, lines, c, half, P), order, poles, name) for c in centres]
+        [_fit(_window(spectra, lines, c, half, P), order, poles, name) for c in centres.tolist()]
         for name, spectra in ((name, _spectra(members, P, lines)) for name, members in points.items())
     ]
-    frequency = lines[centres] * dataset.sample_rate / chosen[0].period
-    power = sample_noise_power(dataset, chosen[0].period * P, frequency)
+    frequency = lines[centres] * dataset.sample_rate / period
+    power = sample_noise_power(dataset, period * P, frequency)
     noise, total = (np.stack([_covariance(row, power, kind) for row in results]) for kind in ("noise", "total"))
     k = np.arange(n * n)
     std = [np.sqrt(np.stack([unvec(c[:, k, k].real, n) for c in C])) for C in (noise, total)]
@@ -151,7 +153,8 @@ def _spectra(members: list[Segment], P: int, lines: np.ndarray) -> tuple[np.ndar
     """Reference (E, N/2 + 1, n) and torque with acceleration (E, N/2 + 1, 2 n) of whole records."""
     R, Z = [], []
     for s in members:
-        N = P * int(s.period)
+        assert s.period is not None and s.r is not None  # checked
+        N = P * s.period
         w = 2 * np.pi * np.arange(N // 2 + 1) / (N * float(np.median(np.diff(s.t))))
         r, u, q = (np.fft.rfft(x[:N], axis=0, norm="forward") for x in (s.r, s.tau, s.q))
         excitation = np.zeros_like(r)

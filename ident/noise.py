@@ -102,7 +102,7 @@ def noise_alone(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, fl
         d = (e - e.mean(axis=1, keepdims=True))[:, :, : group.n_compared]
         scale = len(e) * (P - 1) * P
         return d.reshape(-1, *d.shape[2:]) / np.sqrt(scale), np.arange(group.n_compared), float(len(e) * (P - 1))
-    if group.U_noise is None:
+    if group.U_noise is None or group.Q_noise is None:
         return None
     lines = group.noise_spacing * np.arange(LEAKED, group.U_noise.shape[1])
     d = group.U_noise[:, LEAKED:] - np.einsum("lij,slj->sli", Z[lines], group.Q_noise[:, LEAKED:], optimize=True)

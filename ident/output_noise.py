@@ -59,6 +59,7 @@ def output_covariance(
     position = problem.q_std**2 / samples
     if group.rounding is not None:
         position = position + group.rounding[:, None]
+    assert group.link_std is not None  # link encoders are compared along motions
     recorded, true = prediction.filters
     per_position = prediction.about.output_per_position[: len(S)] * true[: len(S), None]
     per_position[:, :n] *= recorded[: len(S), :, None]

@@ -111,18 +111,19 @@ def runs_of(dataset: Dataset, *, role: str = "identification", amplitude: float 
     points, _ = choose_segments(dataset, role, amplitude)
     chosen = [s for members in points.values() for s in members]
     first = chosen[0]
-    for s in chosen:
-        if s.tau.shape != first.tau.shape or s.transient_periods * s.period != first.transient_periods * first.period:
+    leading = [s.transient_periods * int(s.period or 0) for s in chosen]
+    for s, skipped in zip(chosen, leading, strict=True):
+        if s.tau.shape != first.tau.shape or skipped != leading[0]:
             raise DataError("samples", s.name, f"{s.n_samples}", f"{first.n_samples}, as in {first.name}")
         if s.q0 is None:
             raise DataError("q0", s.name, "none", "the posture at rest")
-    y, q0 = np.stack([s.q for s in chosen]), np.stack([m[0].q0 for m in points.values()])
+    y, q0 = np.stack([s.q for s in chosen]), np.stack([m[0].q0 for m in points.values() if m[0].q0 is not None])
     point = np.repeat(np.arange(len(points)), [len(m) for m in points.values()])
-    skip = first.transient_periods * first.period
+    skip = leading[0]
     noise = noise_of(dataset, "q")
     spread = spread_at_start(y - q0[point][:, None], noise, 1.0 / dataset.sample_rate)
     if spread is not None:
-        skip = max(skip, first.period)
+        skip = max(skip, int(first.period or 0))
         if skip >= y.shape[1]:
             raise DataError(
                 "periods", dataset.name, "a single one that begins in motion", "one to settle and one to count"
@@ -211,10 +212,13 @@ def fit_prediction(
             raise DataError("guide", "fit_prediction", "a predictor that fails", "one that runs where the other does")
         _, F = score(lambda x: look(x, guide), near, x)
         moves = np.diag(np.minimum(WIDE / np.sqrt(np.maximum(np.diag(F), 1e-300)), WIDEST))
-        ends = [(look(x + move), look(x - move)) for move in moves]
-        if any(end is None for pair in ends for end in pair):
-            raise DataError("predictor", "fit_prediction", "a failure beside the estimate", "one that runs there")
-        return np.array([a.log_likelihood - b.log_likelihood for a, b in ends]) / (2 * np.diag(moves)), F
+        rises = []
+        for move in moves:
+            after, before = look(x + move), look(x - move)
+            if after is None or before is None:
+                raise DataError("predictor", "fit_prediction", "a failure beside the estimate", "one that runs there")
+            rises.append(after.log_likelihood - before.log_likelihood)
+        return np.array(rises) / (2 * np.diag(moves)), F
 
     now = look(x)
     if now is None:
@@ -231,7 +235,7 @@ def fit_prediction(
             break
         trial = look(x + step)
         gain = -1.0 if trial is None else 2 * (trial.log_likelihood - now.log_likelihood) / promised
-        if gain > 0:
+        if trial is not None and gain > 0:
             x, now = x + step, trial
             g, F = slopes(now, x)
             damping = max(damping * (0.2 if gain > 0.5 else 1.0), 1e-9)

@@ -101,7 +101,8 @@ def start_times(dataset: Dataset) -> dict[str, float]:
 
 def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, began: Mapping[str, float]) -> Group:
     first = members[0]
-    fs, N = dataset.sample_rate, int(first.period)
+    fs, N = dataset.sample_rate, first.period
+    assert N is not None  # of a multisine
     top = min(int(np.floor(band_hz * N / fs + 1e-9)), N // 2 - 1)
     n_lines = min(int(np.ceil(SIGNAL_BAND * top)) + 2, N // 2)
     q = [_steady(s, "q") for s in members]
@@ -155,7 +156,8 @@ def _middle_periods(members: list[Segment]) -> np.ndarray:
 
 def _steady(segment: Segment, channel: str) -> np.ndarray:
     """Steady periods (P, N, n) of a channel, less what they creep by."""
-    N = int(segment.period)
+    N = segment.period
+    assert N is not None  # of a multisine
     samples = getattr(segment, channel)[: segment.transient_periods * N]
     return without_creep(segment.periodic(channel), samples[-N:] if len(samples) >= N else None)
 
@@ -223,7 +225,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
     if segment.q_link is not None:
         link = _lines(close_motion(segment.q_link, n_return, fs, curvature=True)[None], n_lines)
     # Dry friction turns where the velocity does: of that the compared lines alone know to hundredths of a second.
-    fast = _lines(q[None], min(N // 2, (n_time + 1) // 2))[None, :, n_lines:]
+    beyond = _lines(q[None], min(N // 2, (n_time + 1) // 2))[None, :, n_lines:]
     white_noise = difference_noise(segment.q) ** 2 / N
     group = Group(
         operating_point=segment.operating_point or segment.name,
@@ -244,7 +246,7 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
         periods=np.ones(1, int),
         white_noise=white_noise,
         white_torque_noise=difference_noise(segment.tau) ** 2 / N,
-        Q_fast=signal_power(fast, white_noise),
+        Q_fast=signal_power(beyond, white_noise),
         link_std=None if segment.q_link is None else difference_noise(segment.q_link),
         n_slow=n_slow,
         rest=at_rest(segment.q, fs, REST_TIME)[None, np.minimum((time * fs).astype(int), len(segment.t) - 1)],

@@ -17,6 +17,10 @@ BLOCK = 256  # points
 FUSED = {"contract"}  # products with sums in one instruction
 
 
+# parent, prismatic, rotation, origin, mass, lever, inertia and gravity of a chain, as compiled code takes them
+ChainArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Chain:
     """An open chain of joints with one coordinate each, as arrays over N joints.
@@ -66,7 +70,7 @@ def newton_euler(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> n
     return recursion(*along_z(chain), q, np.sin(q), np.cos(q), v, a)
 
 
-def along_z(chain: Chain) -> tuple[np.ndarray, ...]:
+def along_z(chain: Chain) -> ChainArrays:
     """The arguments of ``recursion`` but the motion: the chain in frames turned so that each joint is along its ``z``.
 
     To turn by a joint is a few products there.

@@ -85,7 +85,7 @@ def fit_rigid(structure: Structure, nominal: Parameters, groups: Sequence[Group]
         problem = _Weighted.build(y, Y, a, v, friction, np.maximum(scale, 1e-9))
         x, H = _minimise(problem, roots, x, center, prior)
         scale = np.sqrt(np.mean(problem.left(_model(roots, x, n)) ** 2, axis=0)) * scale
-    power = sum(group.period_time * float(np.mean(group.window**2)) for group in groups)
+    power = sum(group.period_time * group.window_share for group in groups)
     rms = scale * np.sqrt(len(y) / power)
     pi, dpi = _inertias(roots, x[: COORDINATES * B])
     covariance = np.linalg.inv(H + np.diag(prior))
@@ -133,6 +133,7 @@ def carried_over(structure: Structure, nominal: Parameters, groups: Sequence[Gro
 
 def cut(group: Group, part: int, parts: int, inside: bool) -> Group:
     """A motion seen through its window in one of so many parts of time, or outside of it; both fade at the cuts."""
+    assert group.window is not None  # of a motion
     time = np.arange(group.n_time) * group.period_time / group.n_time
     length = time[np.flatnonzero(group.window).max()] / parts
     # No cut where the record itself begins or ends.
@@ -170,7 +171,8 @@ def _rows(structure: Structure, coupling: np.ndarray, group: Group, indices: Seq
     links = [np.zeros((len(x), structure.n_coordinates)) for x in kinds]
     for link, x in zip(links, kinds, strict=True):
         link[:, structure.driven] = x @ coupling.T
-    torques = regressor(chain_of(structure.model), *links, [i - 1 for i in indices])[:, structure.driven]
+    q, qd, qdd = links
+    torques = regressor(chain_of(structure.model), q, qd, qdd, [i - 1 for i in indices])[:, structure.driven]
     v = group.to_time(s * group.Q[0])
     sign = np.stack([direction(x[None], SLOW * float(np.std(x)) + 1e-12)[0] for x in v.T], axis=-1)
     lines = {
@@ -180,6 +182,7 @@ def _rows(structure: Structure, coupling: np.ndarray, group: Group, indices: Seq
         "v": s * group.Q[0],
         "sign": group.to_lines(sign),
     }
+    assert group.window is not None  # of a motion
     window = np.interp(np.arange(coarse.n_time) / coarse.n_time, np.arange(group.n_time) / group.n_time, group.window)
     coarse = replace(coarse, window=window)
 

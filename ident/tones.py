@@ -70,7 +70,9 @@ def swinging(Z: np.ndarray) -> np.ndarray:
 
 def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, float]:
     """Power (K, n) of the scatter at each line over that near by, ones at the mean; and its degrees of freedom."""
-    d, _, dof = noise_alone(group, Z)
+    noise = noise_alone(group, Z)
+    assert noise is not None  # of several periods
+    d, _, dof = noise
     power = np.sum(np.abs(d) ** 2, axis=0)
     torque, position = white_levels(power[1:], Z[1 : len(power)], np.full(len(power) - 1, dof))
     # What rounding leaves of records without noise is none, and holds no tone.

@@ -28,7 +28,7 @@ def ends_of_transients(members: Sequence[Segment], top: int) -> tuple[int, np.nd
     """Spectra of noise of the torque and of the position, as a line of one period holds it.
 
     Args:
-        members: records of one period.
+        members: records of the same period.
         top: highest compared line.
 
     Returns:
@@ -37,11 +37,13 @@ def ends_of_transients(members: Sequence[Segment], top: int) -> tuple[int, np.nd
     """
     if any(s.steady_periods != 1 or s.transient_periods < 1 for s in members):
         return None
+    period = members[0].period
+    assert period is not None  # records of periods
     before, after = (
-        [{c: getattr(s, c)[-m * s.period :][: s.period] for c in ("tau", "q")} for s in members] for m in (2, 1)
+        [{c: getattr(s, c)[-m * period :][:period] for c in ("tau", "q")} for s in members] for m in (2, 1)
     )
     for spacing in SHARES:
-        width, lines = int(members[0].period) // spacing, top // spacing + 1
+        width, lines = period // spacing, top // spacing + 1
         if lines < FEWEST_LINES + LEAKED:
             return None
         channels = [
@@ -50,7 +52,7 @@ def ends_of_transients(members: Sequence[Segment], top: int) -> tuple[int, np.nd
         if any(_goes_on(x, lines // 2 + 1) for x in channels):
             continue
         # A difference of two holds twice the noise, and a line of a period that of its samples over their number.
-        torque, position = (_spectrum(x, lines) / np.sqrt(2.0 * members[0].period) for x in channels)
+        torque, position = (_spectrum(x, lines) / np.sqrt(2.0 * period) for x in channels)
         return spacing, torque, position
     return None
 

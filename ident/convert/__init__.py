@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -207,7 +208,7 @@ def _filled(clocks: list[Stamps], start: float, end: float) -> Filled | None:
 
 
 def _cut(
-    name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray], data: dict[str, np.ndarray]
+    name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, Any], data: dict[str, np.ndarray]
 ) -> list[Segment]:
     """Segments of one log: parts of a multisine, or a motion."""
     N = len(t)
@@ -246,7 +247,7 @@ def _cut(
     return out
 
 
-def _motions(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, np.ndarray]) -> list[Segment]:
+def _motions(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, Any]) -> list[Segment]:
     role = next((m.roles[k] for k in _called(name, path) if k in m.roles), None)
     if m.split is None or role is not None:
         return [Segment(name=name, kind="trajectory", role=role or "identification", t=t, **channels)]

@@ -75,7 +75,7 @@ def oriented(x: np.ndarray) -> np.ndarray:
 
 def words_of(name: str) -> tuple[str, ...]:
     """Parts of a name: "rec.actPos_mot1" gives rec, act, pos, mot; "Istposition" gives ist, position."""
-    words = []
+    words: list[str] = []
     for word in re.findall(r"[A-Za-zµ]+", name):
         words += [word] if word in PREFIXED else re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", word).split()
     return tuple(part for w in words for part in _split(w.lower()))

@@ -95,9 +95,10 @@ def render(
             if channel in ("tau", "q"):
                 meaning = "motor torque or current" if channel == "tau" else "motor position"
                 lines += ["", f"# EDIT: nothing in the log looks like the {meaning}; complete and take the # away"]
-                unit = {"tau": ("N m", "N"), "q": ("rad", "m")}[channel]
+                units = {"tau": ("N m", "N"), "q": ("rad", "m")}[channel]
                 lines += [
-                    f'# {channel}_{j + 1} = {{ source = "...", unit = "{unit[int(linear[j])]}" }}' for j in range(arm.n)
+                    f'# {channel}_{j + 1} = {{ source = "...", unit = "{units[int(linear[j])]}" }}'
+                    for j in range(arm.n)
                 ]
             continue
         family, scale = chosen[channel], scales[channel]
@@ -112,7 +113,8 @@ def render(
             lines.append("# might also be: " + ", ".join(plain(f.name) for f in others[channel]))
         broken = channel == "qd" and "EDIT" in scale.note
         for j, (source, index) in enumerate(family.sources):
-            options = [o for o in scale.options if channel != "tau" or o != "sign = -1" or scale.signs[j] < 0]
+            forward = channel == "tau" and scale.signs is not None and not scale.signs[j] < 0
+            options = [o for o in scale.options if not (forward and o == "sign = -1")]
             if linear[j] and not np.all(linear):
                 options = [
                     f'unit = "{LINEAR_UNITS[u]}"' if (u := o[len('unit = "') : -1]) in LINEAR_UNITS else o

@@ -171,7 +171,7 @@ def _unit(median: float, named: str | None, t: np.ndarray) -> tuple[str, float, 
     return unit, 1.0 / (median * UNITS[unit]), "" if fitting else f"EDIT: {in_seconds:.6g} Hz if in s"
 
 
-def _pairs(single: dict[str, Family]) -> list[tuple[Family, tuple[tuple[str, str], ...]]]:
+def _pairs(single: dict[str, Family]) -> list[tuple[Family, tuple[tuple[str, str]]]]:
     """Full seconds and their fraction in two columns, as in ROS (sec and nanosec) and of Unix (tv_sec and tv_usec)."""
     fractions = {m[1].lower(): (name, PART_UNITS[m[2].lower()]) for name in single if (m := PARTS.match(name))}
     out = []

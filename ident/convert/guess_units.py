@@ -216,7 +216,7 @@ def _fitting(family: Family, arm: Robot, linear: np.ndarray, rate: float | None,
 
 def _velocity(family: Family, velocity: np.ndarray | None, arm: Robot, linear: np.ndarray) -> Scale:
     """The unit, side and sign that make it the derivative of the position."""
-    choices = ("m/s", "mm/s") if np.all(linear) else ("rad/s", "deg/s", "rpm")
+    choices: tuple[str, ...] = ("m/s", "mm/s") if np.all(linear) else ("rad/s", "deg/s", "rpm")
     named = _unit_of(family, choices)
     choices = (named,) if named else choices
     if velocity is not None:

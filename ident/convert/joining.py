@@ -54,12 +54,14 @@ def on_one_clock(
         own = {k: x for k, x in data.items() if k.startswith(prefix) and k != f"{prefix}{f.time}"}
         signals = {k: _by_time(x, len(clock.t), k, paths[f.prefix]) for k, x in own.items()}
         for c in m.columns:
-            x = signals.get(c.source) if c.turn is not None else None
-            k = 0 if x is None or x.shape[1] == 1 else c.joint if c.index is None else c.index
-            if x is not None and k < x.shape[1]:
+            if c.turn is None or c.source not in signals:
+                continue
+            turns = signals[c.source]
+            k = 0 if turns.shape[1] == 1 else c.joint if c.index is None else c.index
+            if k < turns.shape[1]:
                 # Before samples are put between: halfway between two ends of a turn is nowhere.
                 signals[c.source] = np.concatenate(
-                    [x[:, :k], np.unwrap(x[:, [k]], period=c.turn, axis=0), x[:, k + 1 :]], axis=1
+                    [turns[:, :k], np.unwrap(turns[:, [k]], period=c.turn, axis=0), turns[:, k + 1 :]], axis=1
                 )
         if signals and not at_times(clock, t, m.sample_rate):
             say(

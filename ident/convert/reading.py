@@ -82,7 +82,8 @@ def survey_log(path: Path) -> Survey:
         DataError: where the file is missing, of another format or unreadable.
     """
     signals: Signals = {}
-    dates, doubts, lists = set(), {}, {}
+    dates, lists = set(), {}
+    doubts: dict[str, str] = {}
     labels: dict[str, tuple[str, ...]] = {}
     rows = [0]
     text = READERS.get(path.suffix.lower()) is read_text
@@ -378,7 +379,7 @@ def _hdf5_texts(file: Any, item: Any) -> np.ndarray | None:
 
     if item.dtype != h5py.ref_dtype or item.external or item.is_virtual or not 0 < item.size <= MOST_ELEMENTS:
         return None
-    parts = [file[ref] if ref else None for ref in np.asarray(item).ravel()]
+    parts: list[Any] = [file[ref] if ref else None for ref in np.asarray(item).ravel()]
     if not all(isinstance(p, h5py.Dataset) and p.attrs.get("MATLAB_class", b"") == b"char" for p in parts):
         return None
     if any(p.external or p.is_virtual or p.size > LONGEST_NAME or p.dtype != np.uint16 for p in parts):
