@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import secrets
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -139,8 +140,9 @@ def experiment(
     if made.robot.folder != arm.folder:
         raise DataError("--plan", str(plan), f"a plan for {made.robot.name}", f"one for {arm.name}")
     _check_out(check_target(out))
-    run = {"seed": seed, "drives": figures, "name": out.name, "link_encoders": link_encoders}
-    summary, text = {"dataset": str(out)}, ""
+    run: dict[str, Any] = {"seed": seed, "drives": figures, "name": out.name, "link_encoders": link_encoders}
+    summary: dict[str, Any] = {"dataset": str(out)}
+    text = ""
     with _progress(quiet or json_) as (_, share):
         if one_recording:
             data, spent = _one_recording(made, hidden, progress=share, **run)
@@ -291,7 +293,7 @@ def demo(
     _check_out(out)
     if real is not None:
         return _demo_real(real, out, json_, quiet)
-    seed = int(np.random.SeedSequence().entropy % 100_000) if seed is None else seed
+    seed = secrets.randbelow(100_000) if seed is None else seed
     rng = np.random.default_rng(seed)
     arm = _robot("ur10")
     hidden = draw_effect(rng, arm, names=DEMO_EFFECTS)
@@ -312,8 +314,9 @@ def demo(
             result = diagnose_fully(data, progress=say)
         say("writing report and recording")
         write_outputs(result, out)
-    truth = {"effect": hidden.name, "place": hidden.place, "parameters": parameters_of(hidden)}
-    shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in truth["parameters"].items())
+    parameters = parameters_of(hidden)
+    truth = {"effect": hidden.name, "place": hidden.place, "parameters": parameters}
+    shown = ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in parameters.items())
     text = _verdict_text(result, out) + f"\nTruth (seed {seed}): {hidden.name} at {hidden.place}, {shown}"
     _print({"seed": seed, "truth": truth, "verdict": result.verdict.to_dict()}, json_, text)
 

@@ -269,12 +269,12 @@ def _add_drive(spec: mujoco.MjSpec, name: str, figures: dict[str, float]) -> Non
 
 def _add_chain(spec: mujoco.MjSpec, robot: Robot, hinges: Sequence[Elasticity]) -> None:
     root = ET.parse(robot.urdf).getroot()
-    links = {e.get("name"): e for e in root.findall("link")}
+    links = {e.attrib["name"]: e for e in root.findall("link")}
     joints = root.findall("joint")
     children: dict[str, list[ET.Element]] = {}
     for joint in joints:
-        children.setdefault(joint.find("parent").get("link"), []).append(joint)
-    base = set(links) - {j.find("child").get("link") for j in joints}
+        children.setdefault(_link_at(joint, "parent"), []).append(joint)
+    base = set(links) - {_link_at(joint, "child") for joint in joints}
     loads: dict[str, list] = {}
     for load in robot.loads:
         loads.setdefault(load.link, []).append(load)
@@ -284,8 +284,8 @@ def _add_chain(spec: mujoco.MjSpec, robot: Robot, hinges: Sequence[Elasticity]) 
         for i, load in enumerate(loads.get(link, [])):
             _add_mass(body, f"load:{link}:{i}", load.mass, load.com, load.inertia)
         for joint in children.get(link, []):
-            name, kind = joint.get("name"), joint.get("type")
-            child = joint.find("child").get("link")
+            name, kind = joint.attrib["name"], joint.get("type")
+            child = _link_at(joint, "child")
             R, p = _origin(joint)
             axis = _numbers(joint.find("axis"), "xyz", "1 0 0")
             if kind != "fixed" and name not in robot.joint_names:
@@ -337,10 +337,11 @@ def _set_inertia(body: mujoco.MjsBody, link: ET.Element) -> None:
         body.mass, body.inertia = 1e-9, [1e-12] * 3
         return
     R, p = _origin(inertial)
-    I = inertial.find("inertia")
+    mass, I = inertial.find("mass"), inertial.find("inertia")
+    assert mass is not None and I is not None  # a robot's URDF is checked
     ixx, ixy, ixz, iyy, iyz, izz = (float(I.get(k, 0)) for k in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
     tensor = R.as_matrix() @ np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]) @ R.as_matrix().T
-    _put_inertia(body, float(inertial.find("mass").get("value")), p, tensor)
+    _put_inertia(body, float(mass.attrib["value"]), p, tensor)
 
 
 def _put_inertia(body: mujoco.MjsBody, mass: float, com: np.ndarray, tensor: np.ndarray) -> None:
@@ -359,6 +360,13 @@ def _put_inertia(body: mujoco.MjsBody, mass: float, com: np.ndarray, tensor: np.
 def _add_mass(body: mujoco.MjsBody, name: str, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
     part = body.add_body(name=name)
     _put_inertia(part, mass, np.asarray(com, float), np.asarray(inertia, float))
+
+
+def _link_at(joint: ET.Element, end: str) -> str:
+    """The link at an end of a joint, "parent" or "child"."""
+    element = joint.find(end)
+    assert element is not None  # a robot's URDF is checked
+    return element.attrib["link"]
 
 
 def _origin(element: ET.Element) -> tuple[Rotation, np.ndarray]:

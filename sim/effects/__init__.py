@@ -13,6 +13,7 @@ from robot_assets.errors import DataError
 from robot_assets.robot import Robot
 from robot_assets.urdf import read_urdf
 from sim.effects import drive, friction, sensing, structure, transmission
+from sim.effects.effect import Effect
 
 _CLASSES = (
     friction.CoulombFriction,
@@ -76,12 +77,12 @@ LONGEST = 1.0  # s of a delay
 EFFECTS = {c.name: c for c in _CLASSES}
 
 
-def parameters_of(effect: object) -> dict[str, object]:
+def parameters_of(effect: Effect) -> dict[str, object]:
     """Parameters of an effect by their catalogue names."""
     return {f.name.rstrip("_"): getattr(effect, f.name) for f in dataclasses.fields(effect) if f.name != "place"}
 
 
-def make_effect(name: str, place: str, **values: Any) -> object:
+def make_effect(name: str, place: str, **values: Any) -> Effect:
     """An effect from its catalogue name, place and parameters.
 
     Raises:
@@ -107,7 +108,7 @@ def make_effect(name: str, place: str, **values: Any) -> object:
     return cls(place=place, **{fields[k].name: v for k, v in values.items()})
 
 
-def parse_effect(text: str, robot: Robot) -> object:
+def parse_effect(text: str, robot: Robot) -> Effect:
     """An effect from ``NAME@PLACE:key=value,...``; sizes of ``draw_effect`` where no key is given.
 
     Raises:
@@ -200,7 +201,7 @@ def draw_effect(
     strength: float = 1.0,
     place: str | None = None,
     peak_torque: np.ndarray | None = None,
-) -> object:
+) -> Effect:
     """An effect of random kind, place and size, clearly seen in an experiment of default size.
 
     Args:

@@ -15,11 +15,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
 
 import mujoco
 import numpy as np
 
 from robot_assets.robot import Robot
+
+
+class Effect(Protocol):
+    """What every effect has; the rest is looked for in it."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def place(self) -> str: ...
 
 
 @dataclass(frozen=True)
