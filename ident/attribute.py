@@ -329,7 +329,7 @@ def carried_on(search: Search, known: Attribution, workers: Workers) -> Search:
 def untaken(hypotheses: Sequence[Hypothesis], effects: Sequence[Effect]) -> tuple[Hypothesis, ...]:
     """Hypotheses that may be sought beside effects: a special case of what is there already would only share its size
     with it."""
-    taken = {e.hypothesis.key for e in effects}
+    taken: set[tuple[str | None, str]] = {e.hypothesis.key for e in effects}
     taken |= {(e.hypothesis.options.get("absorbs"), e.hypothesis.place) for e in effects}
     loaded = any(effect == "payload" for effect, _ in taken)
     return tuple(h for h in hypotheses if h.key not in taken and not (loaded and h.options.get("carries_load")))

@@ -117,7 +117,7 @@ def build_body(robot: Robot, rng: np.random.Generator) -> Body:
     geometry, note = _geometry(robot, model)
     body = Body(model, index, rest, geometry, frames[flange], note)
     if geometry is not None:
-        _drop_always_touching(body, robot, rng)
+        _drop_always_touching(body, geometry, robot, rng)
     return body
 
 
@@ -156,16 +156,14 @@ def _geometry(robot: Robot, model: pin.Model) -> tuple[pin.GeometryModel | None,
     return geometry, ""
 
 
-def _drop_always_touching(body: Body, robot: Robot, rng: np.random.Generator) -> None:
+def _drop_always_touching(body: Body, geometry: pin.GeometryModel, robot: Robot, rng: np.random.Generator) -> None:
     """Remove pairs that touch in nearly every posture: shapes drawn too fat, or parts locked together."""
-    data, touch = body.model.createData(), body.geometry.createData()
-    hits = np.zeros(len(body.geometry.collisionPairs))
+    data, touch = body.model.createData(), geometry.createData()
+    hits = np.zeros(len(geometry.collisionPairs))
     low, high = reach(robot)
     for _ in range(TRIALS):
-        pin.computeCollisions(
-            body.model, data, body.geometry, touch, configuration(body, rng.uniform(low, high)), False
-        )
+        pin.computeCollisions(body.model, data, geometry, touch, configuration(body, rng.uniform(low, high)), False)
         hits += [result.isCollision() for result in touch.collisionResults]
-    always = [p for p, k in zip(list(body.geometry.collisionPairs), hits, strict=True) if k > ALWAYS * TRIALS]
+    always = [p for p, k in zip(list(geometry.collisionPairs), hits, strict=True) if k > ALWAYS * TRIALS]
     for pair in always:
-        body.geometry.removeCollisionPair(pair)
+        geometry.removeCollisionPair(pair)

@@ -153,12 +153,12 @@ def alike(found: Round, winner: Hypothesis) -> list[Effect]:
     """Effects at the joint of a winner that are hard to tell from it, as they were screened: the round may not have
     tried them."""
     twins = {e for pair in ALIKE if winner.effect in pair for e in pair - {winner.effect}}
-    scores = [
-        s
+    starts = [
+        (s.hypothesis, s.start)
         for s in found.scores
         if s.hypothesis.effect in twins and s.hypothesis.joint == winner.joint and s.start is not None
     ]
-    return [Effect(s.hypothesis, clip_to_bounds(s.hypothesis, s.start)) for s in scores[:1]]
+    return [Effect(h, clip_to_bounds(h, start)) for h, start in starts[:1]]
 
 
 def as_load(current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]:

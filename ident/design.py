@@ -130,13 +130,13 @@ def design_experiment(
     excitation = make_plan(
         robot, points=1, validation_points=0, levels=(1.0,), trajectory=False, seed=seed, postures=drawn.q[:1], **grid
     ).excitation
-    given, H = None, []
+    given, each = None, []
     for d, par in enumerate(_prior(nominal, draws, rng)):
         lins = linearised(structure, par, drawn.q)
         given = given or conditions(structure, excitation, lins, par, realizations=realizations)
         report = None if progress is None else lambda share, d=d: progress((d + share) / draws)
-        H.append(information(structure, par, lins, given, report))
-    H = np.stack(H)
+        each.append(information(structure, par, lins, given, report))
+    H = np.stack(each)
     names = parameter_names(robot)
     _check_seen(H, names, robot.name)
     best = optimal_weights(H, criterion=criterion)

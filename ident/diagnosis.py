@@ -329,11 +329,11 @@ def by_link_encoders(
     both, told = with_link_encoders(wide.problem, late), setup.problem
     wide = replace(wide, problem=replace(both, q_std=told.q_std, tau_std=told.tau_std, sampling=told.sampling))
     try:
-        both = fit_baseline(wide.problem, workers.say)
-        found = attribute(wide.problem, both, max_causes=max_causes, workers=workers.for_half())
+        fitted = fit_baseline(wide.problem, workers.say)
+        found = attribute(wide.problem, fitted, max_causes=max_causes, workers=workers.for_half())
     except NOT_COMPUTED:
         return None
-    return wide, recorded, both, found
+    return wide, recorded, fitted, found
 
 
 def explained(result: Attribution) -> bool:

@@ -69,7 +69,8 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     band = motion_band_hz(dataset, structure, nominal)
     groups = build_groups(dataset, motion_band_hz=band, fast=fast)
     multisines = tuple(g for g in groups if g.window is None)
-    held_out, ran_away = (), runaways(dataset)
+    held_out: tuple[Group, ...] = ()
+    ran_away = runaways(dataset)
     told = replace(dataset, segments=tuple(s for s in dataset.segments if s.name not in ran_away))
     if told.select(role="validation"):
         held_out = build_groups(told, role="validation", motion_band_hz=band, fast=fast)
@@ -305,9 +306,8 @@ def with_known_noise(problem: Problem) -> Problem:
     def known(group: Group) -> Group:
         if group.window is not None or group.U_noise is None:
             return group
-        return replace(
-            group, known_noise=tuple(std**2 / problem.samples(group) for std in (problem.tau_std, problem.q_std))
-        )
+        torque, position = (std**2 / problem.samples(group) for std in (problem.tau_std, problem.q_std))
+        return replace(group, known_noise=(torque, position))
 
     return replace(problem, groups=tuple(map(known, problem.groups)))
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 
@@ -84,8 +85,15 @@ def linearised(structure: Structure, par: Parameters, postures: np.ndarray) -> l
     return [linearise(structure, equilibrium(structure, par, q)) for q in postures]
 
 
-def motor_loads(structure: Structure, par: Parameters, lins: Sequence[Linearisation]) -> dict[str, np.ndarray]:
+class MotorLoads(TypedDict):
     """Least ``inertia`` that each motor moves, kg m2, and largest ``gravity_torque``, N m, for ``make_plan``; (n,)."""
+
+    inertia: np.ndarray
+    gravity_torque: np.ndarray
+
+
+def motor_loads(structure: Structure, par: Parameters, lins: Sequence[Linearisation]) -> MotorLoads:
+    """What motors move and bear at worst over linearisations."""
     driven = structure.driven
     return {
         "inertia": par.inertia + np.min([np.diag(lin.M)[driven] for lin in lins], axis=0),

@@ -213,7 +213,8 @@ def solve(
         W, enough = static_remainder(structure, par, plane, group), REMAINDER_CHANGE
     if react is not None:
         torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-    left, past, changes = np.arange(len(W)), [], []
+    left, changes = np.arange(len(W)), []
+    past: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(steps):
         Q_a = link_motion(structure, par, plane, Q, W, torques)
         change = geometric_remainder(structure, plane, group, Q_a) - W

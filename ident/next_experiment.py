@@ -170,11 +170,11 @@ def _separation(problem: Problem, option: _Option, a: Fit, b: Fit) -> float:
 
 def _expected(problem: Problem, group: Group, a: Fit, b: Fit) -> float:
     """``_separation`` of models of which there is no record yet."""
-    preds = [predict(x.model, group, problem.sampling) for x in (a, b)]
+    by_a, by_b = (predict(x.model, group, problem.sampling) for x in (a, b))
     here = replace(problem, groups=(group,))
-    weighted = [make_weights(here, [x], 0.0) for x in preds]
+    weighted = [make_weights(here, [x], 0.0) for x in (by_a, by_b)]
     falls = []
-    for fit, own, other, weights in ((a, *preds, weighted[0]), (b, *preds[::-1], weighted[1])):
+    for fit, own, other, weights in ((a, by_a, by_b, weighted[0]), (b, by_b, by_a, weighted[1])):
         change = group.observe(other.U - own.U)
         H, moment = jacobian(here, fit.model, group, own).normal(weights.whiten[0], change)
         known = fit.information + H

@@ -67,7 +67,9 @@ def _shared(target: Path) -> bool:
 
 def _exchange(a: Path, b: Path) -> bool:
     """Two folders change places at one stroke; False where the system cannot."""
-    libc = ctypes.CDLL(None, use_errno=True) if os.name == "posix" else None
+    if os.name != "posix":
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
     first, second = os.fsencode(a), os.fsencode(b)
     if hasattr(libc, "renameat2"):
         return bool(libc.renameat2(AT_FDCWD, first, AT_FDCWD, second, EXCHANGE) == 0)

@@ -179,6 +179,7 @@ def extended_by(effects: Sequence[Effect], score: Score) -> tuple[Effect, ...]:
     start = score.start
     if special:
         start = h.options["absorb"](start, score.weights, special[0].p)
+    assert start is not None  # else it is no candidate
     kept = tuple(e for e in effects if not special or e.hypothesis.key != special[0].hypothesis.key)
     return (*kept, Effect(h, clip_to_bounds(h, start)))
 

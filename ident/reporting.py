@@ -79,7 +79,8 @@ def spectrum_map(problem: Problem, fit: Fit, before: Sequence[Prediction], after
         powers = [np.mean(np.abs(residual(group, p)) ** 2, axis=0) for p in (before[g], pred)]
         for i, power in enumerate([*powers, noise]):
             np.add.at(out[i, g].T, band, power * weight)
-    return SpectrumMap(edges, *np.sqrt(out), tuple(g.operating_point for g in problem.groups))
+    rms_before, rms_after, rms_noise = np.sqrt(out)
+    return SpectrumMap(edges, rms_before, rms_after, rms_noise, tuple(g.operating_point for g in problem.groups))
 
 
 def frf_views(
@@ -164,7 +165,9 @@ def evidence_plot(
     bare = [predict(rest, group, problem.sampling) for group in problem.groups]
     j, n = h.joint if h.joint >= 0 else most_affected(problem, bare), problem.structure.n
     by_link = h.channel == "spring" and all(j in group.links for group in problem.groups)
-    xs, ys, ms = [], [], []
+    xs: list[np.ndarray] = []
+    ys: list[np.ndarray] = []
+    ms: list[np.ndarray] = []
     for group, pred, without in zip(problem.groups, predictions, bare, strict=True):
         motion = pred.motion()
         band = slice(group.n_compared, None)
@@ -174,13 +177,11 @@ def evidence_plot(
             X = (outputs - without.outputs())[..., row : row + 1]
             X[:, band] = 0.0
             curves.append(group.to_time(X)[..., 0])
-        variable = {
-            "v": lambda m=motion, j=j: m.v(j),
-            "q": lambda m=motion, j=j: m.q(j),
-            "delta": lambda m=motion, j=j: m.delta(j),
-            "time": lambda m=motion: m.time,
-            "torque": lambda m=motion, j=j: m.torque(j),
-        }.get(h.variable, lambda c=curves: c[1])()
+        of_joint = {"v": motion.v, "q": motion.q, "delta": motion.delta, "torque": motion.torque}
+        if h.variable in of_joint:
+            variable = of_joint[h.variable](j)
+        else:
+            variable = motion.time if h.variable == "time" else curves[1]
         # A motion is closed by a return that nobody recorded.
         recorded = slice(None) if group.window is None else group.window > 0.5
         if by_link:  # the zero of the encoder is not known

@@ -121,7 +121,8 @@ def attribute_once(
         least, bare: as of ``search.explore``, from the model as it is.
         quiet: joints at which no strong effect is sought, and what is left asks for no hinge.
     """
-    before, softly = current, {}
+    before = current
+    softly: dict[tuple[str, str], float] = {}
     found, scores = explore(problem, current, hypotheses, least, bare, workers, quiet=quiet)
     excess = max(current.cost - current.count, 1.0)
     told = bool(found) and settles_its_joint(problem, current, *found[0])

@@ -288,9 +288,11 @@ def simulated(problem: Problem, h: Hypothesis, result: Fit) -> tuple[Hypothesis,
     *others, last = result.model.effects
     model = replace(result.model, effects=(*others, replace(last, hypothesis=loop)))
     other = refit(problem, model, result.weights, result.remainders, FIRST_STEPS)
+    if other is None:
+        return h, result
     # At the joint itself: another cause may be elsewhere.
     j = h.joint
-    own = None if other is None else under_own_noise(problem, other)
+    own = under_own_noise(problem, other)
     if own is None or in_another_motion(j, own, result):
         return h, result
     return (h, result) if excess_under(problem, j, own, result.weights) > left_along(j, result) else (loop, other)

@@ -134,6 +134,7 @@ def anneal(
     """
     stages: list[Fit] = []
     for i, rho in enumerate(ladder):
+        say = None if progress is None else lambda text, i=i: progress(f"{text}, stage {i + 1}/{len(ladder)}")
         stages.append(
             fit(
                 problem,
@@ -143,9 +144,7 @@ def anneal(
                 iterations=iterations,
                 gap=gap,
                 remainders=stages[-1].remainders if stages else remainders,
-                progress=None
-                if progress is None
-                else lambda text, i=i: progress(f"{text}, stage {i + 1}/{len(ladder)}"),
+                progress=say,
             )
         )
     return replace(stages[-1], softer=tuple(stages[:-1]))
@@ -190,11 +189,11 @@ def fit(
     limit = TIMING_LIMIT * problem.sampling.sample_time
     m = len(model.par.to_log())
     center, prior = prior_of(problem, model)
-    Ws = list(remainders) if remainders is not None else [None] * len(problem.groups)
+    starts = [None] * len(problem.groups) if remainders is None else remainders
     count = data_count(problem)
     prior[:m] += hold * count
     x = pack(model)
-    preds = predictions(problem, model, Ws, steps=REMAINDER_STEPS)
+    preds = predictions(problem, model, starts, steps=REMAINDER_STEPS)
     Ws = [p.solution.W for p in preds]
     if weights is None:
         weights = make_weights(problem, preds, rho)
@@ -290,7 +289,7 @@ def fit(
         H = information_left(H, share * shared_information(problem, model, preds, weights))
     costs = fair_costs(problem, preds, weights)
     names = coordinate_names(model)
-    return Fit(model, costs, data_counts(problem), H, names, tuple(Ws), weights, converged, share=share)
+    return Fit(model, costs, data_counts(problem), H, names, tuple(Ws), weights, converged, share=share or 0.0)
 
 
 Settled = tuple[Model, list[Prediction], list[np.ndarray], float]

@@ -172,9 +172,12 @@ def shown(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
     if "shown" in h.options:
         i = final.names.index(h.coordinate(h.options["shown"]))
         return bool(covariance[i, i] < UNTOLD**2)
-    if any(q.null is None for q in h.parameters):
+    nulls = [q.null for q in h.parameters if q.null is not None]
+    if len(nulls) < len(h.parameters):
         return True
-    off = np.array([q.to_internal(v) - q.to_internal(q.null) for q, v in zip(h.parameters, effect.p, strict=True)])
+    off = np.array(
+        [q.to_internal(v) - q.to_internal(null) for q, v, null in zip(h.parameters, effect.p, nulls, strict=True)]
+    )
     return bool(off @ np.linalg.solve(covariance[np.ix_(at, at)], off) > MIN_EVIDENCE)
 
 
@@ -187,6 +190,7 @@ def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect
         return False
     wave_number, path = effect.value(RIPPLE), 0.0
     for group, pred in zip(problem.groups, predictions, strict=True):
+        assert group.window is not None  # of a motion
         speed = np.abs(pred.motion().v(effect.hypothesis.joint)) * (group.window > 0.5)
         slow = wave_number * speed < group.omega[group.n_compared - 1]
         path += float(np.sum(speed[slow])) * group.period_time / speed.shape[1]
@@ -197,7 +201,8 @@ def within_steps(effect: Effect, steps: Sequence[Steps]) -> bool:
     """Whether an error of a position is smaller than the steps in which this comes: it may be what these leave."""
     if effect.hypothesis.channel != "position" or not is_wave(effect.hypothesis.parameters):
         return False
-    amplitude = np.hypot(*(effect.value(name) for name in WAVE))
+    sine, cosine = (effect.value(name) for name in WAVE)
+    amplitude = np.hypot(sine, cosine)
     return any(x.joint == effect.hypothesis.joint and amplitude < x.resolution for x in steps)
 
 

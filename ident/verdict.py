@@ -112,9 +112,10 @@ class Gain:
         """Rms error over all joints, before and after; of ``joints`` where single ones are not known."""
         if not self.by_joint:
             return self.before, self.after
-        return tuple(
+        before, after = (
             float(np.sqrt(np.mean([getattr(g, x) ** 2 for g in self.by_joint.values()]))) for x in ("before", "after")
         )
+        return before, after
 
     @property
     def of_some(self) -> bool:

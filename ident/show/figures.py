@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Collection
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
 
 # Stand-ins that the page replaces by its own colours, light or dark.
 INK, SOFT, GRID, MEASURED, BEFORE, AFTER = "#0a0b0c", "#0a0b0d", "#0a0b0e", "#0a0b0f", "#0a0b10", "#0a0b11"
@@ -25,7 +29,7 @@ CSS = {
     AFTER: "var(--after)",
 }
 DARK = {INK: "#e6e8ea", SOFT: "#9aa4ad", GRID: "#34393e", MEASURED: "#b9c1c8", BEFORE: "#e0694e", AFTER: "#3f9fc4"}
-STYLE = {
+STYLE: dict[RcKeyType, Any] = {
     "font.size": 8,
     "text.color": INK,
     "axes.labelcolor": SOFT,

@@ -79,12 +79,12 @@ def _eye(diagnosis: Diagnosis) -> rrb.EyeControls3D | None:
     structure = build_structure(diagnosis.robot)
     data, q = structure.model.createData(), np.zeros(structure.model.nq)
     trace = diagnosis.traces[0].q
-    points = []
+    places = []
     for row in trace[:: max(1, len(trace) // 50)]:
         q[structure.driven] = row
         pin.forwardKinematics(structure.model, data, q)
-        points.append([M.translation.copy() for M in data.oMi])
-    points = np.array(points)
+        places.append([M.translation.copy() for M in data.oMi])
+    points = np.array(places)
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     x, y = (points[:, -1] - points[:, 0]).mean(axis=0)[:2]
     aside = np.array([y, -x, 0.0]) if np.hypot(x, y) > 1e-3 else np.array([1.0, -1.0, 0.0])

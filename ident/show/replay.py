@@ -180,6 +180,7 @@ def replay(arm: Arm, group: Group, sampling: Sampling) -> Replay:
             change = float(np.linalg.norm((U - old)[:, :K]) / np.linalg.norm((group.U - U)[:, :K]))
             if change < REPEATS:
                 break
+    assert U is not None
     tracking = np.sqrt(np.mean((q - reference[:, ::m]) ** 2, axis=1))
     return Replay(U, tracking, change)
 
