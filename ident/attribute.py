@@ -9,7 +9,7 @@ from all of them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -143,6 +143,7 @@ def attribute(
     max_causes: int = 4,
     hypotheses: Sequence[Hypothesis] | None = None,
     known: Attribution | None = None,
+    until: Callable[[Fit], bool] | None = None,
     workers: Workers = Workers(),
 ) -> Attribution:
     """Find the causes of what the baseline does not explain.
@@ -150,6 +151,7 @@ def attribute(
     Args:
         max_causes: rounds at most; an effect found at several joints at once is one of them.
         known: causes of the same records that were found beside more noise, from which the search goes on.
+        until: whether a model with the causes so far shows that the search must begin anew, beside something else.
         workers: where candidates are fitted.
     """
     if hypotheses is None:
@@ -165,6 +167,8 @@ def attribute(
         search = carried_on(search, known, workers)
     while search.causes < max_causes and not search.over and not workers.late:
         search = next_round(task, search)
+        if until is not None and until(search.current):
+            break
     current, rounds = at_the_end(task, search, every)
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)

@@ -22,6 +22,7 @@ from ident.problem import Problem
 from ident.quantization import Steps
 from ident.reporting import where
 from ident.rigid import RigidFit
+from ident.time_steps import TimeSteps
 from ident.tones import Tone
 from ident.torque_fit import Fit
 from ident.trust import (
@@ -292,6 +293,15 @@ def roll_off_note(problem: Problem) -> str:
         f"The recorded torque is {abs(lost):.2%} too {'small' if lost > 0.0 else 'large'} at {omega / 2.0 / np.pi:.3g} Hz,"
         " by the square of the frequency and alike at all joints. That is taken for the recorder, which averages samples or"
         " holds them, and not for a cause."
+    )
+
+
+def step_note(steps: TimeSteps) -> str:
+    """Records of a simulation that steps in time, as of ``time_steps.TimeSteps``."""
+    return (
+        f"The records show the error of a simulation in time steps of {1e3 * steps.length:.3g} ms, by semi-implicit Euler with"
+        f" dampers that are {'implicit for each body apart' if steps.apart else steps.dampers}, alike at all joints. That is no cause: it is part of how the"
+        " records are compared, and the parameters are those of the arm without it."
     )
 
 

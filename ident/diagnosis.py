@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.attribute import Attribution, attribute
 from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed
-from ident.conclude import conclude, named_effects, roll_off_note
+from ident.conclude import conclude, named_effects, roll_off_note, step_note
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, ratio_interval, segment_errors
@@ -26,6 +26,7 @@ from ident.identification import (
     set_up,
     under_noise_beside_causes,
     with_noise_of_fast_lines,
+    with_steps_of,
 )
 from ident.left_out import SEED, errors_on_parts, joined, refitted
 from ident.leftover import find_leftover
@@ -37,6 +38,7 @@ from ident.period_checks import unrepeated
 from ident.problem import NOT_COMPUTED, predictions
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, carried_over, fit_rigid
+from ident.stepping import with_steps
 from ident.swings import swings, without_swings
 from ident.tones import Tone, find_tones
 from ident.torque_checks import mislabelled
@@ -162,6 +164,8 @@ def diagnose_fully(
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
     notes += [f"Not used: {line}." for line in not_fitted(given)]
+    if problem.steps is not None:
+        notes.append(step_note(problem.steps))
     if problem.sampling.roll_off:
         notes.append(roll_off_note(problem))
     if gain is None and not setup.held_out:
@@ -255,14 +259,33 @@ def sought(
 ) -> tuple[Setup, Fit, Attribution]:
     """Causes of what the baseline leaves; once more where beside these the noise turns out to be far more or far less
     than was guessed, or that the arm still swung."""
-    return beside_steady_records(*under_noise_seen(dataset, setup, baseline, max_causes, workers), max_causes, workers)
+    found = under_noise_seen(dataset, *beside_steps(setup, baseline, max_causes, workers), max_causes, workers)
+    return beside_steady_records(*found, max_causes, workers)
+
+
+def beside_steps(setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
+    """Causes of what the baseline leaves; beside the time steps of a simulation that made the records, where a model
+    with some of them shows these and the baseline was too far from the data for that."""
+
+    def shows_steps(fit: Fit) -> bool:
+        try:
+            return bool(fit.model.effects) and with_steps(setup.problem, fit)[0] is not setup.problem
+        except NOT_COMPUTED:
+            return False
+
+    result = attribute(setup.problem, baseline, max_causes=max_causes, until=shows_steps, workers=workers)
+    if workers.late or not shows_steps(result.final):
+        return setup, baseline, result
+    workers.say("time steps of a simulation")
+    setup = with_steps_of(setup, with_steps(setup.problem, result.final)[0])
+    baseline = fit_baseline(setup.problem, workers.say)
+    return setup, baseline, attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
 
 
 def under_noise_seen(
-    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
+    dataset: Dataset, setup: Setup, baseline: Fit, result: Attribution, max_causes: int, workers: Workers
 ) -> tuple[Setup, Fit, Attribution]:
-    """Causes of what the baseline leaves, under the noise that is seen beside them."""
-    result = attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
+    """Causes of what the baseline leaves, under the noise that is seen beside those found."""
     try:
         louder = with_noise_of_fast_lines(dataset, setup.problem, result.final)
         if louder is not setup.problem and not workers.late:

@@ -80,7 +80,9 @@ class Prediction:
         Z = self.about.Z
         if np.any(self.added_stiffness):
             stiffness = np.maximum(self.par.stiffness + self.added_stiffness, 0.05 * self.par.stiffness)
-            Z = impedance(self.structure, replace(self.par, stiffness=stiffness), self.about.lin, self.about.s)[0]
+            Z = impedance(
+                self.structure, replace(self.par, stiffness=stiffness), self.about.lin, self.about.s, self.about.steps
+            )[0]
         Z = self.plane.record[:, None, None] * Z
         recorded, true = self.filters
         return recorded[:, :, None] * Z * true[:, None, :]

@@ -64,9 +64,11 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
     Between two sizes at which a record changes from one motion to another the cost has a minimum each. So has a
     friction that turns at once, and that turns within a velocity that is seen.
     """
+    # Noise that is taken too large shows in what is left at the other joints.
+    noise = min(1.0, float(np.median(current.costs / current.counts)))
     for effect in current.model.effects:
         h, resized, j = effect.hypothesis, effect.hypothesis.options.get("bends"), effect.hypothesis.joint
-        if current.costs[j] <= DETECTION_EXCESS * current.counts[j]:
+        if current.costs[j] <= DETECTION_EXCESS * noise * current.counts[j]:
             continue
         turned = either_turn(problem, current, effect)
         if turned.cost < current.cost - MIN_EVIDENCE:

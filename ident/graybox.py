@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from ident.chain import Structure
+from ident.time_steps import TimeSteps, differences
 from robot_assets.robot import Robot
 
 
@@ -216,12 +217,13 @@ def alias_response(
 
 
 def impedance(
-    structure: Structure, par: Parameters, lin: Linearisation, s: np.ndarray
+    structure: Structure, par: Parameters, lin: Linearisation, s: np.ndarray, steps: TimeSteps | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Torque per motor position of the linearised arm.
 
     Args:
         s: (F,) complex frequencies, rad/s.
+        steps: of a simulation; powers of s below are then its ``differences``.
 
     Returns:
         Z: (F, n, n) N m/rad, ``s^2 J + s f + T^T (C - C S^T A^{-1} S C) T``.
@@ -231,17 +233,25 @@ def impedance(
     n, driven = structure.n, structure.driven
     K = stiffness_diagonal(structure, par)
     D = damping_diagonal(structure, par)
-    A = s[:, None, None] ** 2 * lin.M + lin.Kg
+    rate, square = differences(s, steps)
+    A = square[:, None, None] * lin.M + lin.Kg
     diag = np.arange(structure.n_coordinates)
-    A[:, diag, diag] += K + s[:, None] * D
+    A[:, diag, diag] += K + rate[:, None] * D
+    if apart := 0.0 if steps is None else steps.apart:
+        A[:, diag, diag] += apart * square[:, None] * D
     A_inv = np.linalg.inv(A)
-    C = par.stiffness + s[:, None] * par.damping
+    C = par.stiffness + rate[:, None] * par.damping
     Z = -C[:, :, None] * A_inv[:, driven[:, None], driven] * C[:, None, :]
     k = np.arange(n)
     Z[:, k, k] += C
     Z = par.coupling.T @ Z @ par.coupling
-    Z[:, k, k] += s[:, None] ** 2 * par.inertia + s[:, None] * par.viscous
+    Z[:, k, k] += square[:, None] * rotor_inertia(par, steps) + rate[:, None] * par.viscous
     return Z, A_inv, C
+
+
+def rotor_inertia(par: Parameters, steps: TimeSteps | None) -> np.ndarray:
+    """(n,) inertia of the motors, kg m2, with what resists beside it in time steps."""
+    return par.inertia if steps is None else par.inertia + steps.apart * (par.damping + par.viscous)
 
 
 def sampled_frf(

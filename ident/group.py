@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import scipy.fft
 
+from ident.time_steps import TimeSteps
+
 # standard deviations of a velocity, and share of its rms, below which a motor may as well rest
 SURE, CREEPING = 3.0, 0.02
 NOISE_LINES = 10  # lines on either side over which the noise of the position is averaged
@@ -49,6 +51,7 @@ class Group:
             of which they are measured; or None.
         rounding: (K, n) variance of a line of the mean position by the steps of its encoder, rad2, which repeats with
             the motion and does not average out over periods; or None.
+        steps: of a simulation that made the records; None of a machine.
         creeps: whether single periods end elsewhere than the one before, of a transient.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
@@ -83,6 +86,7 @@ class Group:
     known_noise: tuple[np.ndarray, np.ndarray] | None = None
     rounding: np.ndarray | None = None
     creeps: bool = False
+    steps: TimeSteps | None = None
 
     @property
     def shows_noise(self) -> bool:

@@ -32,6 +32,7 @@ from ident.recorded_noise import declared_position_noise, given_noise, least_noi
 from ident.records import build_groups
 from ident.refits import under_own_noise
 from ident.roll_off import with_roll_off
+from ident.stepping import in_steps, shown_steps, told_by
 from ident.swings import swings, without_swings
 from ident.torque_fit import Fit
 from robot_assets.errors import DataError
@@ -137,13 +138,7 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     """Baseline parameters by maximum likelihood on the torque residual."""
     setup = set_up(dataset)
     try:
-        problem, result = with_roll_off(setup.problem, fit_baseline(setup.problem, progress))
-        setup = replace(setup, problem=problem)
-        louder = with_noise_of_unexcited_lines(dataset, setup.problem, result)
-        if louder is not setup.problem:
-            setup = replace(setup, problem=louder)
-            result = fit_baseline(louder, progress)
-        setup, result = under_noise_that_is_left(dataset, setup, result, progress)
+        setup, result = in_shown_steps(dataset, *first_model(dataset, setup, progress), progress)
     except FloatingPointError as err:
         found = "motions along which the links of the model cannot be solved"
         raise DataError(
@@ -169,6 +164,37 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
     # Where periods differ by a drift, as those of a motor that sticks do, what they differ by is no noise.
     share = 0.0 if np.any(drifting(setup.problem.groups)) else result.share
     return replace(setup, problem=replace(problem, scatter_share=share), held_out=held_out), result
+
+
+def first_model(dataset: Dataset, setup: Setup, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:
+    """The setup with what the record of the torque loses, and under the noise that is seen beside the drives; the drives
+    that fit it."""
+    problem, result = with_roll_off(setup.problem, fit_baseline(setup.problem, progress))
+    setup = replace(setup, problem=problem)
+    louder = with_noise_of_unexcited_lines(dataset, setup.problem, result)
+    if louder is not setup.problem:
+        setup = replace(setup, problem=louder)
+        result = fit_baseline(louder, progress)
+    return under_noise_that_is_left(dataset, setup, result, progress)
+
+
+def in_shown_steps(
+    dataset: Dataset, setup: Setup, result: Fit, progress: Callable[[str], None] | None = None
+) -> tuple[Setup, Fit]:
+    """The setup and its first model in the time steps of a simulation that the records show (``stepping``), where these
+    leave no more than noise at most joints; else as they are."""
+    steps = shown_steps(setup.problem, result)
+    if steps is None:
+        return setup, result
+    sampling = replace(setup.problem.sampling, roll_off=0.0)
+    stepped = with_steps_of(setup, replace(in_steps(setup.problem, steps), sampling=sampling))
+    other, again = first_model(dataset, stepped, progress)
+    return (other, again) if told_by(result, again) else (setup, result)
+
+
+def with_steps_of(setup: Setup, problem: Problem) -> Setup:
+    """The setup with a problem, and what is held out of it in the same time steps."""
+    return replace(setup, problem=problem, held_out=tuple(replace(g, steps=problem.steps) for g in setup.held_out))
 
 
 def whitened(problem: Problem, result: Fit, found: Sequence[Prediction]) -> list[np.ndarray]:

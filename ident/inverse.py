@@ -23,11 +23,21 @@ import scipy.fft
 
 from ident.chain import Structure
 from ident.columns import Products
-from ident.graybox import Linearisation, Parameters, alias_response, equilibrium, hold_response, impedance, linearise
+from ident.graybox import (
+    Linearisation,
+    Parameters,
+    alias_response,
+    equilibrium,
+    hold_response,
+    impedance,
+    linearise,
+    rotor_inertia,
+)
 from ident.group import Group
 from ident.mixing import mixed
 from ident.motion import Solution, Torques
 from ident.recursion import chain_of, newton_euler
+from ident.time_steps import TimeSteps, differences
 
 REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
@@ -55,7 +65,7 @@ class Plane:
 
     Attributes:
         lin: equilibrium and matrices.
-        s: (L,) j omega.
+        s: (L,) j omega. steps: of the group.
         Z: (L, n, n) motor torque per motor position, continuous.
         A_inv: (L, N, N); C: (L, n).
         record: (L,) recorded torque per continuous torque.
@@ -68,6 +78,7 @@ class Plane:
 
     lin: Linearisation
     s: np.ndarray
+    steps: TimeSteps | None
     Z: np.ndarray
     A_inv: np.ndarray
     C: np.ndarray
@@ -77,6 +88,11 @@ class Plane:
     link_per_position: np.ndarray
     link_per_spring: np.ndarray
     link_per_load: np.ndarray
+
+    @cached_property
+    def differences(self) -> tuple[np.ndarray, np.ndarray]:
+        """(L,) of a position its velocity and its acceleration, as dampers and inertias see them."""
+        return differences(self.s, self.steps)
 
     def outputs(self, torque: np.ndarray, link: np.ndarray) -> np.ndarray:
         """Responses (L, n, ...) of the motor torque, as recorded, and below them (L, M, ...) those of the links."""
@@ -107,6 +123,8 @@ def make_plane(structure: Structure, par: Parameters, group: Group, sampling: Sa
     """Linearise a group at its own parameter-dependent equilibrium."""
     lin = linearise(structure, equilibrium(structure, par, group.posture))
     hold = hold_response(group.omega, sampling.sample_time, sampling.hold)
+    if group.steps is not None and sampling.hold == "zoh":  # such a step holds no torque itself
+        hold = hold / np.abs(hold_response(group.omega, group.steps.length, "zoh"))
     record = recorded_share(group.omega, par.timing, sampling.roll_off) / hold
     return plane_at(structure, par, lin, group, record)
 
@@ -119,14 +137,15 @@ def recorded_share(omega: np.ndarray, timing: float, roll_off: float) -> np.ndar
 def plane_at(structure: Structure, par: Parameters, lin: Linearisation, group: Group, record: np.ndarray) -> Plane:
     """The linear arm at a given linearisation; ``record`` (L,) as in ``Plane``."""
     s = 1j * group.omega
-    Z, A_inv, C = impedance(structure, par, lin, s)
+    Z, A_inv, C = impedance(structure, par, lin, s, group.steps)
     driven = structure.driven
     link_gain = par.coupling.T @ (C[:, :, None] * A_inv[:, driven, :])
     spring_gain = par.coupling.T - link_gain[:, :, driven]
     rows = A_inv[:, driven[list(group.links)]]
     link_per_spring = rows[..., driven]
     link_per_position = (link_per_spring * C[:, None]) @ par.coupling
-    return Plane(lin, s, Z, A_inv, C, record, spring_gain, link_gain, link_per_position, link_per_spring, -rows)
+    gains = (spring_gain, link_gain, link_per_position, link_per_spring, -rows)
+    return Plane(lin, s, group.steps, Z, A_inv, C, record, *gains)
 
 
 def true_position(
@@ -277,8 +296,8 @@ def _solution(
     Q_driven = Q_a[..., structure.driven]
     delta = Q @ par.coupling.T - Q_driven
     tau_s = plane.C * delta + torques.spring
-    s = plane.s[:, None]
-    U = (s**2 * par.inertia + s * par.viscous) * Q + tau_s @ par.coupling + torques.motor
+    rate, square = (x[:, None] for x in plane.differences)
+    U = (square * rotor_inertia(par, plane.steps) + rate * par.viscous) * Q + tau_s @ par.coupling + torques.motor
     return Solution(Q, Q_a, Q_driven, delta, tau_s, plane.record[:, None] * U, W, torques)
 
 
@@ -288,18 +307,18 @@ def baseline_products(structure: Structure, par: Parameters, plane: Plane, solut
     Torques of effects and the geometric remainder are held. Columns in the order of the parameters.
     """
     n, elastic = structure.n, np.asarray(structure.elastic, int)
-    s = plane.s[:top, None]
+    rate, square = (x[:top, None] for x in plane.differences)
     springs = plane.output_per_spring[:top]
     motors = plane.output_per_motor[:top]
     hinges = plane.output_per_load[:top, :, elastic]
     gains = np.concatenate(
         [
             springs * par.stiffness,
-            springs * (par.damping * s)[:, None],
-            motors * (par.inertia * s**2)[:, None],
-            motors * (par.viscous * s)[:, None],
+            springs * (par.damping * rate)[:, None],
+            motors * (par.inertia * square)[:, None],
+            motors * (par.viscous * rate)[:, None],
             hinges * par.elastic_stiffness,
-            hinges * (par.elastic_damping * s)[:, None],
+            hinges * (par.elastic_damping * rate)[:, None],
         ],
         axis=-1,
     )

@@ -176,7 +176,7 @@ def band_of(found: Sequence[Excess]) -> tuple[float, float]:
     frequency = np.concatenate([e.frequency for e in found])
     power = np.concatenate([e.power.sum(axis=0) for e in found])
     order = np.argsort(frequency)
-    below = np.maximum.accumulate(np.cumsum(power[order]))
+    below = np.maximum.accumulate(np.cumsum(power[order]).clip(0.0))
     low, high = np.searchsorted(below, np.array(BAND) * below[-1])
     return float(frequency[order][low]), float(frequency[order][high])
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ident.graybox import Parameters
+from ident.graybox import Parameters, rotor_inertia
 from ident.group import Group, signal_share
+from ident.time_steps import differences
 
 
 @dataclass(frozen=True)
@@ -152,8 +153,11 @@ class Motion(Recorded):
         return self.asked_of[joint]
 
     def _asked(self, joint: int) -> np.ndarray:
-        s, x = 1j * self.group.omega, self.solution
-        linear = (s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) * x.Q[..., joint]
+        rate, square = differences(1j * self.group.omega, self.group.steps)
+        x = self.solution
+        linear = (square * rotor_inertia(self.par, self.group.steps)[joint] + rate * self.par.viscous[joint]) * x.Q[
+            ..., joint
+        ]
         carried = x.tau_s @ self.par.coupling[:, joint]
         others = self.beside[..., joint] if isinstance(self.beside, np.ndarray) else self.beside
         given = self.group.U if self.delivered is None else self.delivered

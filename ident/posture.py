@@ -24,11 +24,11 @@ def moved_by_posture(pred: Prediction) -> np.ndarray:
     plane, here = pred.plane, pred.plane.lin
     motion = pred.solution.Q_a.copy()
     motion[:, 0] -= here.q
-    s = plane.s[:, None, None]
+    square = plane.differences[1][:, None, None]
     changes = []
     for shift in MOVED * np.eye(len(here.q)):
         there = linearise(pred.structure, here.q + shift)
-        changes.append((s**2 * (there.M - here.M) + (there.Kg - here.Kg)) / MOVED)
+        changes.append((square * (there.M - here.M) + (there.Kg - here.Kg)) / MOVED)
     loads = np.stack([np.matmul(change, motion[..., None])[..., 0] for change in changes], axis=-1)
     return np.matmul(plane.output_per_load, loads)
 

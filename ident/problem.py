@@ -15,6 +15,7 @@ from ident.inverse import Sampling
 from ident.model import Model
 from ident.motion import Torques
 from ident.parallel import map_threads
+from ident.time_steps import TimeSteps
 
 NOT_COMPUTED = (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeError)  # a model that has no solution
 
@@ -46,6 +47,11 @@ class Problem:
     def motions_alone(self) -> bool:
         """Whether no record is periodic."""
         return all(group.window is not None for group in self.groups)
+
+    @property
+    def steps(self) -> TimeSteps | None:
+        """Time steps of the simulation that made the records; None of a machine."""
+        return self.groups[0].steps
 
     def samples(self, group: Group) -> int:
         """Samples of a period of a group, or of the whole of a motion."""

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.fft
 
 from ident.chain import Structure
-from ident.graybox import Parameters, damping_diagonal, stiffness_diagonal
+from ident.graybox import Parameters, damping_diagonal, rotor_inertia, stiffness_diagonal
 from ident.group import Group, signal_share
 from ident.hypotheses import kernels
 from ident.hypotheses.loop import modal_state, steady_loop
@@ -138,8 +138,12 @@ def _along_record(
         j, c: joint, and its link coordinate; others: (S, L) torque of other laws of the same gear; motor: (S, L, n)
             torque of effects at the motors.
     """
-    solution, s = motion.solution, plane.s[:, None]
-    drive = group.U / plane.record[:, None] - (s**2 * par.inertia + s * par.viscous) * solution.Q - motor
+    solution, (rate, square) = motion.solution, (x[:, None] for x in plane.differences)
+    drive = (
+        group.U / plane.record[:, None]
+        - (square * rotor_inertia(par, plane.steps) + rate * par.viscous) * solution.Q
+        - motor
+    )
     carried = (drive @ np.linalg.inv(par.coupling))[..., j]
     more = (carried - solution.tau_s[..., j])[:, 1:]
     gain = 1.0 - plane.C[:, j] * plane.A_inv[:, c, c]

@@ -90,6 +90,11 @@ def test_the_growth_with_the_level_is_found_over_groups_that_differ(exponent):
     assert growth_of([SimpleNamespace(amplitude=v) for v in levels], found) == pytest.approx(exponent)
 
 
+def test_records_that_leave_less_than_noise_have_a_band_too():
+    low, high = band_of([excess(np.full((2, 5), -0.5))])
+    assert 0.0 <= low <= high <= 4.0
+
+
 def test_there_is_no_growth_of_one_level_or_of_nothing():
     one, two = (SimpleNamespace(amplitude=np.array(v)) for v in ([1.0, 1.0], [0.5, 1.0]))
     assert growth_of([one], [excess(np.ones((2, 3)))]) is None

@@ -192,7 +192,7 @@ def link_friction(joint: int, place: str) -> Hypothesis:
 
     def responses(structure, par, plane, group, solution, shape):
         c = structure.driven[joint]
-        rate = plane.s * solution.Q_a[..., c]
+        rate = plane.differences[0] * solution.Q_a[..., c]
         return [plane.output_per_load[:, :, c] * rate[..., None]]
 
     return Hypothesis(
