@@ -16,6 +16,8 @@ from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
 
+LIKE = (0.8, 1.25)  # a channel over what tells the same, of one unit and sign
+FOLLOWED = (0.5, 2.0)  # the same of a reference over what follows it
 FREEZE = 0.1  # s: a channel that stands still for longer while the joint moves
 CLIPPED = 3e-3  # share of the samples at the very largest value, in runs of three or more
 SMOOTH = 1e-5  # torque noise over torque rms, below which a log was filtered
@@ -81,13 +83,15 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
             out.append(
                 f"tau_{j + 1} ({name}) stays below {top:.3g} {newton}, its limit is {limits[j]:.4g}: current, or torque before the gear?"
             )
-        for channel, x, reference in (("qd", s.qd, v), ("q_link", s.q_link, s.q), ("q_ref", s.q_ref, s.q)):
+        # A loop follows a slow reference as it is, and one near its bandwidth more or less.
+        compared = (("qd", s.qd, v, LIKE), ("q_link", s.q_link, s.q, LIKE), ("q_ref", s.q_ref, s.q, FOLLOWED))
+        for channel, x, reference, (low, high) in compared:
             if x is None or not np.all(np.isfinite(x[:, j])) or np.ptp(x[:, j]) == 0:
                 continue
             a, b = x[:, j] - x[:, j].mean(), reference[:, j] - reference[:, j].mean()
             # Only where the two tell the same story can their sizes be compared.
             gain, alike = _gain(a, b)
-            if alike > 0.9 and not 0.8 < gain < 1.25:
+            if alike > 0.9 and not low < gain < high:
                 what = f"the derivative of q_{j + 1}" if channel == "qd" else f"q_{j + 1}"
                 out.append(f"{channel}_{j + 1} ({name}) is {gain:.4g} times {what}: wrong unit or sign?")
     return out
@@ -222,12 +226,13 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
 
 
 def _recurring(found: np.ndarray, period: int | None) -> np.ndarray:
-    """(N,) whether what was found at a sample is found in half of the periods there: it is of the motion, not of the
+    """(N,) whether what was found at a sample is found in most of the periods there: it is of the motion, not of the
     log."""
-    if period is None or len(found) < 2 * period:
+    periods = 0 if period is None else (len(found) + 1) // period  # found between samples
+    if period is None or periods < 2:
         return np.zeros(len(found), bool)
     place = np.arange(len(found)) % period
-    often = np.bincount(place, weights=found, minlength=period) >= 0.5 * (len(found) // period)
+    often = np.bincount(place, weights=found, minlength=period) > 0.5 * periods
     return often[place]
 
 

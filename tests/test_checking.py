@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from ident import skew_checks
-from ident.channel_checks import lost_sample_warnings
+from ident.channel_checks import lost_sample_warnings, unit_warnings
 from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
 from ident.skew_checks import _far_skew as far_skew
@@ -457,3 +457,11 @@ def test_sound_torques_and_those_that_no_sign_explains_are_read_as_recorded(name
         other.tau,
     ):
         assert match_torques(replace(s, tau=tau), dataset(robot, s)).readings == {}
+
+
+def test_a_loop_need_not_follow_a_fast_reference_in_full(arm, log):
+    """Near its bandwidth a loop moves more or less than it is asked to; of another unit or sign it is far off."""
+    for factor, told in ((1.36, False), (0.7, False), (-1.0, True), (180.0 / np.pi, True)):
+        middle = log.q.mean(axis=0)
+        asked = replace(log, q_ref=middle + factor * (log.q - middle))
+        assert any(w.startswith("q_ref") for w in unit_warnings(asked, dataset(arm, asked))) is told
