@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS
 from ident.evidence import Candidate, last_is_pointless
 from ident.hypotheses import Hypothesis
 from ident.hypotheses.friction import bristled_stribeck
@@ -27,6 +26,7 @@ from ident.refits import (
     polish,
     refit,
     reweighted,
+    unsettled_at,
 )
 from ident.rounds import MIN_EVIDENCE, Round
 from ident.screening import screen, signal_scale
@@ -64,11 +64,9 @@ def from_other_motions(problem: Problem, current: Fit, workers: Workers) -> Fit:
     Between two sizes at which a record changes from one motion to another the cost has a minimum each. So has a
     friction that turns at once, and that turns within a velocity that is seen.
     """
-    # Noise that is taken too large shows in what is left at the other joints.
-    noise = min(1.0, float(np.median(current.costs / current.counts)))
     for effect in current.model.effects:
         h, resized, j = effect.hypothesis, effect.hypothesis.options.get("bends"), effect.hypothesis.joint
-        if current.costs[j] <= DETECTION_EXCESS * noise * current.counts[j]:
+        if not unsettled_at(current, j):
             continue
         turned = either_turn(problem, current, effect)
         if turned.cost < current.cost - MIN_EVIDENCE:

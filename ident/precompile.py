@@ -11,7 +11,7 @@ from ident.chain import build_structure
 from ident.hypotheses.friction import direction
 from ident.hypotheses.kernels import BACKLASH, HYSTERESIS, Law, along_motion
 from ident.hypotheses.loop import steady_loop
-from ident.hypotheses.yielding import bristle
+from ident.hypotheses.yielding import bristle, dipping_bristle
 from ident.recursion import chain_of, newton_euler
 from robot_assets.robot import load_robot
 
@@ -22,6 +22,7 @@ def precompile() -> None:
     newton_euler(chain_of(build_structure(load_robot("twomass")).model), *np.zeros((3, 1, 1)))
     direction(still, 1e-3)
     bristle(still, 1e-3, 1e-3, start=np.zeros(1))
+    dipping_bristle(still, 1e-3, 1e3, np.ones((1, 4)))
     for law in (Law(BACKLASH, 1.0, 0.0, 1.0), Law(HYSTERESIS, 1.0, 1.0, 1.0)):
         along_motion(law, still, still)
         steady_loop(law, still, still, mode)

@@ -188,8 +188,11 @@ def level(result: Fit, effect: Effect, covariance: np.ndarray) -> bool:
         return False
     pair = [result.names.index(h.coordinate(name)) for name in h.options["exceeds"]]
     larger, smaller = (effect.value(name) for name in h.options["exceeds"])
-    off = np.array([1.0, -1.0])
-    return bool(np.log(larger / smaller) < ABSENT * np.sqrt(off @ covariance[np.ix_(pair, pair)] @ off))
+    spread = covariance[np.ix_(pair, pair)]
+    if spread[1, 1] > 1.0:  # one far below the other may be anything so small
+        spread = np.diag([spread[0, 0], 1.0])
+    off = np.array([larger, -smaller])
+    return bool(larger - smaller < ABSENT * np.sqrt(off @ spread @ off))
 
 
 def leads_by(problem: Problem, effect: Effect) -> list[float]:

@@ -161,6 +161,13 @@ def settled(current: Fit) -> bool:
     return current.chi2_per_dof <= DETECTION_EXCESS
 
 
+def unsettled_at(current: Fit, joint: int) -> bool:
+    """Whether a model leaves more than noise at a joint, by what it leaves at most joints where that is less than the
+    noise that is assumed."""
+    noise = min(1.0, float(np.median(current.costs / current.counts)))
+    return bool(current.costs[joint] > DETECTION_EXCESS * noise * current.counts[joint])
+
+
 def under_own_noise(problem: Problem, result: Fit) -> Fit | None:
     """A fit as it stands, its cost under the noise that its own model sees; None where drives gone astray make that
     infinite."""

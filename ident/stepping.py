@@ -29,7 +29,7 @@ ALIKE = 4.0  # the same, of a joint from a step as it is sought
 SETTLED = 1.25  # of the noise, that a joint is left with where nothing is missing there
 TELLING = 0.25  # share of what a joint leaves beyond noise, that steps must explain
 BY_CHANCE = 4.0  # fall of a cost by a number more, up to which noise brings it
-SLACK = 0.25  # of the size, by which a joint may differ beside that: its model is not exact
+SLACK = 0.5  # of the size, by which a joint may differ beside that: its model is not exact
 
 
 def with_steps(problem: Problem, result: Fit) -> tuple[Problem, Fit]:

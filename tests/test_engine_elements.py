@@ -122,11 +122,19 @@ def test_a_lag_that_is_stepped_in_time_is_measured(locked, tmp_path, before):
     assert verdict.unexplained_verdict == "noise floor reached"
 
 
-def test_a_bristle_whose_friction_falls_with_speed_is_a_stribeck_friction(locked, tmp_path):
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "within"),
+    [
+        (3e5, 0.0, {"static": 0.1}),  # it slips within the steps of time and the noise of the position
+        (3e4, 30.0, {"static": 0.03, "stribeck_velocity": 0.1, "stiffness": 0.03}),
+    ],
+)
+def test_a_bristle_whose_friction_falls_with_speed_is_a_stribeck_friction(locked, tmp_path, stiffness, damping, within):
+    truth = {"stiffness": stiffness, "coulomb": 2.0, "static": 4.0, "stribeck_velocity": 0.03}
     plan = small_plan(locked, 8, points=1, levels=(1.0,), period=2000)
     data = quick_experiment(
         plan,
-        [Bristle("elbow_joint", (3e5, 0.0, 2.0, 4.0, 0.03))],
+        [Bristle("elbow_joint", (stiffness, damping, 2.0, 4.0, 0.03))],
         seed=8,
         drives=draw_drives(np.random.default_rng(8), locked),
     )
@@ -135,8 +143,8 @@ def test_a_bristle_whose_friction_falls_with_speed_is_a_stribeck_friction(locked
         ("stribeck_friction", "elbow_joint")
     ]
     assert verdict.causes[0].probability > 0.9
-    assert verdict.causes[0].parameters["static"].value == pytest.approx(4.0, rel=0.1)
-    assert verdict.causes[0].parameters["stribeck_velocity"].value == pytest.approx(0.03, rel=0.2)
+    for name, error in within.items():
+        assert verdict.causes[0].parameters[name].value == pytest.approx(truth[name], rel=error)
     assert verdict.unexplained_verdict == "noise floor reached"
 
 
@@ -162,7 +170,9 @@ def test_a_dip_within_velocities_by_which_a_friction_leads_is_none(identified):
     """There a soft constraint takes what is asked of it, whatever its size."""
     _, setup, result = identified
     dip = next(
-        h for h in catalogue(setup.problem.structure) if h.effect == "stribeck_friction" and len(h.parameters) == 6
+        h
+        for h in catalogue(setup.problem.structure)
+        if h.effect == "stribeck_friction" and any(q.name == "lead" for q in h.parameters)
     )
 
     def special(width, lead):

@@ -4,11 +4,11 @@ import numpy as np
 
 from ident.hypotheses.kernels import BACKLASH, HYSTERESIS, Law, along_motion, loop_sweep, smooth_sign
 from ident.hypotheses.loop import steady_loop
-from ident.hypotheses.yielding import along_path, onward
+from ident.hypotheses.yielding import along_path, following, onward
 from ident.precompile import precompile
 from ident.recursion import recursion
 
-COMPILED = (loop_sweep, smooth_sign, along_path, onward, recursion)
+COMPILED = (loop_sweep, smooth_sign, along_path, following, onward, recursion)
 
 
 def test_records_that_settle_at_different_times_call_for_no_more_code():

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from ident.extended import predict
 from ident.hypotheses import catalogue
 from ident.hypotheses.friction import presliding_friction
-from ident.hypotheses.yielding import SLIP, along_path, bristle, elastoplastic, yielded, yielding_point
+from ident.hypotheses.yielding import (
+    SLIP,
+    along_path,
+    bristle,
+    dipping_bristle,
+    elastoplastic,
+    yielded,
+    yielding_point,
+)
 from ident.identification import set_up
 from ident.model import Effect, Model
 from sim import parse_effect
@@ -148,3 +156,24 @@ def test_the_record_says_what_friction_holds_where_a_motion_begins(ur10, tmp_pat
     left = np.abs(group.to_time(group.U - pred.U)[0, :, 2])[group.window > 0.99]
     second = round(1.0 / group.period_time * group.n_time)
     assert np.sqrt(np.mean(left[:second] ** 2)) < 0.02 * 8.0
+
+
+def test_a_bristle_whose_limit_falls_with_speed_is_that_of_lugre():
+    """Against the differential equation ``h' = k (v - |v| h / g(v))``, solved with small steps of another method."""
+    stiffness, dt = 800.0, 1e-3
+    t = np.arange(0.0, 2.0, dt)
+
+    def velocity(t):
+        return 0.04 * np.sin(np.pi * t) + 0.03 * np.sin(3.0 * np.pi * t + 1.0)
+
+    def limit(v):
+        return 0.6 + 0.7 * np.exp(-((v / 0.03) ** 2))
+
+    def rate(t, h):
+        return stiffness * (velocity(t) - np.abs(velocity(t)) * h / limit(velocity(t)))
+
+    exact = scipy.integrate.solve_ivp(rate, (0.0, 4.0), [0.0], t_eval=2.0 + t, rtol=1e-9, atol=1e-10, method="LSODA")
+    found = dipping_bristle(velocity(t)[None], dt, stiffness, limit(velocity(t))[None])[0]
+    assert found == pytest.approx(exact.y[0], abs=2e-3)
+    fast = np.abs(velocity(t)) > 0.9 * np.max(np.abs(velocity(t)))
+    assert np.max(np.abs(found)) > 1.2 * np.max(np.abs(found[fast]))  # it falls, and late

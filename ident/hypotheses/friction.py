@@ -11,7 +11,7 @@ from ident.group import Group
 from ident.hypotheses.drifts import CHANGE, TIME_CONSTANT, first_change, time_constants, warmth
 from ident.hypotheses.hypothesis import EXPONENT, Hypothesis, Parameter, Screen, SignalScale, sought
 from ident.hypotheses.kernels import smooth_sign
-from ident.hypotheses.yielding import DAHL, bristle
+from ident.hypotheses.yielding import DAHL, bristle, dipping_bristle
 from ident.motion import Motion
 
 LEAST_MOTION = 1e-9  # rad, of a joint that stands still
@@ -263,7 +263,7 @@ def stribeck_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
             "shown": "static",
             "exceeds": ("static", "coulomb"),
             "bristled": lambda p, s: [
-                np.array([*p[:3], p[1] / (give * max(s.q, LEAST_MOTION)), p[4]]) for give in GIVES
+                np.array([*p[:3], p[1] / (give * max(s.q, LEAST_MOTION)), p[4], 0.0]) for give in GIVES
             ],
             "special": lambda p: np.array([p[0], 0.0, p[3], *p[5:]]),
             "dry": True,
@@ -278,12 +278,15 @@ def stribeck_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
 
 
 def bristled_stribeck(joint: int, place: str) -> Hypothesis:
-    """The same of a bristle that gives before it slips: as in the LuGre model, of which this is all but the damping of
-    the bristle (Canudas de Wit, Olsson, Astrom and Lischinsky, IEEE Trans. Automatic Control 40, 1995)."""
+    """The same of a bristle that gives before it slips: the LuGre model (Canudas de Wit, Olsson, Astrom and Lischinsky,
+    IEEE Trans. Automatic Control 40, 1995)."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         v = motion.v(j)
-        return _dipping(v, p) * bristle(v, motion.time_step, p[1] / p[3], DAHL)
+        # Velocities within the dip say of the friction beyond it that it is less, and no more.
+        limits = _dipping(v, [max(p[0], p[1] / MOST_DIP), *p[1:]])
+        h = dipping_bristle(v, motion.time_step, p[3], limits)
+        return h + p[5] * rate_of(h, motion.time_step)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v = motion.v(j)
@@ -291,20 +294,20 @@ def bristled_stribeck(joint: int, place: str) -> Hypothesis:
 
         def start(c):
             sizes = _first_sizes(c)
-            return sizes and np.array([*sizes, shape[0], sizes[1] / shape[1], DIP.center])
+            return sizes and np.array([*sizes, shape[0], sizes[1] / shape[1], DIP.center, 0.0])
 
         return Screen((z, z * np.exp(-(np.abs(v / shape[0]) ** DIP.center))), start, shape)
 
     def absorb(p: np.ndarray, weights: np.ndarray, old: np.ndarray) -> np.ndarray:
         coulomb = max(old[1] + weights[0], 0.1 * old[1])
-        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[0], p[4]])
+        return np.array([coulomb, coulomb + max(weights[1], 0.1 * coulomb), p[2], old[0], p[4], old[3]])
 
     plain = stribeck_friction(joint, place)
     coulomb, static, velocity, *_ = plain.parameters
     stiffness = Parameter("stiffness", "N m/rad", 1e-6, 1e12, log=True, nuisance=True, step=1e-2, reported=True)
     return replace(
         plain,
-        parameters=(coulomb, static, velocity, stiffness, DIP),
+        parameters=(coulomb, static, velocity, stiffness, DIP, RELAXATION),
         law=law,
         shapes=lambda scale: [
             (f * scale.v, give * max(scale.q, LEAST_MOTION)) for f in (0.15, 0.5) for give in (0.003, 0.03)
@@ -316,11 +319,18 @@ def bristled_stribeck(joint: int, place: str) -> Hypothesis:
             "apart": "stribeck_velocity",
             "shown": "static",
             "exceeds": ("static", "coulomb"),
-            "special": lambda p: np.array([p[3], p[0], DAHL, 0.0]),
-            "trivial": plain.options["trivial"],
-            "widens": lambda p, s: [np.array([0.6 * p[1], 1.2 * p[1], f * s.v, p[0], DIP.center]) for f in (0.05, 0.3)],
+            "special": lambda p: np.array([p[3], p[0], DAHL, p[5]]),
+            "trivial": lambda p, k: p[1] <= LEAST_DIP * p[0],
+            "widens": lambda p, s: [
+                np.array([0.6 * p[1], 1.2 * p[1], f * s.v, p[0], DIP.center, p[3]]) for f in (0.05, 0.3, 1.0)
+            ],
         },
     )
+
+
+def rate_of(x: np.ndarray, dt: float) -> np.ndarray:
+    """Rate of a signal (S, T) that repeats, by central differences."""
+    return (np.roll(x, -1, axis=1) - np.roll(x, 1, axis=1)) / (2.0 * dt)
 
 
 def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothesis:
@@ -339,7 +349,7 @@ def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothes
         z = bristle(motion.v(j), motion.time_step, p[1] / p[0], p[2], start)
         if not damped:
             return p[1] * z
-        rate = (np.roll(z, -1, axis=1) - np.roll(z, 1, axis=1)) / (2.0 * motion.time_step)
+        rate = rate_of(z, motion.time_step)
         if start is not None:  # what it holds then was not bent in one step
             rate[:, [0, -1]] = 0.0
         return p[1] * (z + p[3] * rate)

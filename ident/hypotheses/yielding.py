@@ -44,6 +44,38 @@ def bristle(
     return onward(steps, 1.0 / length, 1.0, exponent, 1.0, start)
 
 
+def dipping_bristle(v: np.ndarray, dt: float, stiffness: float, limits: np.ndarray) -> np.ndarray:
+    """Torque of a Dahl bristle whose Coulomb torque changes on the way, along one period of a velocity ``v`` (S, T).
+
+    That of the LuGre model but for the damping of the bristle (Canudas de Wit, Olsson, Astrom and Lischinsky, IEEE
+    Trans. Automatic Control 40, 1995).
+
+    Args:
+        dt: s; stiffness: N m/rad; limits: (S, T) N m, above zero.
+    """
+    steps = 0.5 * dt * (v + np.roll(v, 1, axis=1))
+    before = following(steps, stiffness, limits, np.zeros(len(v)))
+    return following(steps, stiffness, limits, before[:, -1].copy())
+
+
+@njit(cache=True, nogil=True)
+def following(steps: np.ndarray, stiffness: float, limits: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Torque (S, T) of a Dahl bristle along steps, from a torque ``start`` (S,).
+
+    Exact where the limit (S, T), that after each step, changes at an even rate over it: a stiff bristle is at the limit.
+    """
+    S, T = steps.shape
+    h, out = start.copy(), np.empty((S, T))
+    for i in range(S):
+        for t in range(T):
+            sign = 1.0 if steps[i, t] > 0 else -1.0
+            before, after = sign * limits[i, t - 1], sign * limits[i, t]
+            lost, share = _decay(2.0 * stiffness * abs(steps[i, t] / (before + after)))
+            h[i] = after - (after - before) * share + (h[i] - before) * (1.0 + lost)
+            out[i, t] = h[i]
+    return out
+
+
 @njit(cache=True, nogil=True)
 def along_path(steps: np.ndarray, stiffness: float, limit: float, exponent: float, recoil: float) -> np.ndarray:
     """Torque of an element that yields along the steps (S, T) of one period, after one period before it."""
