@@ -254,7 +254,7 @@ def with_cause(task: Task, search: Search, question: Question, rounds: tuple[Rou
     if best.decoy and not best.options.get("baseline"):
         return replace(after, over=True) if not question.by_joint or best.on_chain else elsewhere(after, best.joint)
     current = from_other_motions(problem, polish(problem, winner.fit), workers)
-    if current.chi2_per_dof > FAINT and not best.decoy:
+    if (current.chi2_per_dof > FAINT and not best.decoy) or best.options.get("of_record"):
         current, more = companions(problem, current, winner, search.hypotheses)
         after = replace(after, rounds=(*after.rounds, *more))
     effects = current.model.effects

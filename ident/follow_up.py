@@ -110,7 +110,8 @@ def with_bristle(problem: Problem, current: Fit, stribeck: Hypothesis, workers: 
 def companions(
     problem: Problem, current: Fit, winner: Candidate, hypotheses: Sequence[Hypothesis]
 ) -> tuple[Fit, list[Round]]:
-    """A friction just named at other joints too, where at least two of them ask for it: a real arm has it at all.
+    """A friction just named at other joints too, where at least two of them ask for it: a real arm has it at all. So is
+    what a recorder does to one channel.
 
     Nothing else: what one ripple shakes at all joints, others of periods found freely would each explain at their own.
     Each must explain ``LINEAR_SHARE`` of what is left at its own joint by a linear step, and ``MIN_SHARE`` once all
@@ -121,7 +122,7 @@ def companions(
     """
     effect = winner.hypothesis.effect
     same = [h for h in hypotheses if h.effect == effect and h.joint >= 0 and h.key != winner.hypothesis.key]
-    if "friction" not in effect or len(same) < 2:
+    if not ("friction" in effect or winner.hypothesis.options.get("of_record")) or len(same) < 2:
         return current, []
     preds = predictions(problem, current.model, current.remainders)
     noise = current.counts
