@@ -122,11 +122,15 @@ class Plane:
 def make_plane(structure: Structure, par: Parameters, group: Group, sampling: Sampling) -> Plane:
     """Linearise a group at its own parameter-dependent equilibrium."""
     lin = linearise(structure, equilibrium(structure, par, group.posture))
+    return plane_at(structure, par, lin, group, torque_record(par, group, sampling))
+
+
+def torque_record(par: Parameters, group: Group, sampling: Sampling) -> np.ndarray:
+    """Recorded torque per continuous torque of each line; (L,)."""
     hold = hold_response(group.omega, sampling.sample_time, sampling.hold)
     if group.steps is not None and sampling.hold == "zoh":  # such a step holds no torque itself
         hold = hold / np.abs(hold_response(group.omega, group.steps.length, "zoh"))
-    record = recorded_share(group.omega, par.timing, sampling.roll_off) / hold
-    return plane_at(structure, par, lin, group, record)
+    return recorded_share(group.omega, par.timing, sampling.roll_off) / hold
 
 
 def recorded_share(omega: np.ndarray, timing: float, roll_off: float) -> np.ndarray:

@@ -12,10 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from ident.baseline import renewed
-from ident.coordinates import prior_of
-from ident.derivatives import jacobians, normal_equations
+from ident.derivatives import jacobians
 from ident.problem import Problem, predictions
-from ident.torque_fit import RIDGE, Fit, inverse
+from ident.torque_fit import RIDGE, Fit, inverse, left_beside
 
 LEAST_JOINTS = 2  # that must tell it, and agree: of one it may as well be a lag of its drive
 SURE = 5.0  # standard deviations from nothing
@@ -52,19 +51,17 @@ def shared_roll_off(problem: Problem, result: Fit) -> float:
     if problem.sampling.hold != "none" or problem.motions_alone or n < LEAST_JOINTS:
         return 0.0
     preds = predictions(problem, result.model, result.remainders)
-    _, prior = prior_of(problem, result.model)
-    p, columns = len(prior), []
-    for made, pred in zip(jacobians(problem, result.model, preds, exact=False), preds, strict=True):
-        S, top, outputs, _ = made.whole.shape
-        lost = np.zeros((n, S, top, outputs), complex)
+    made, lost = jacobians(problem, result.model, preds, exact=False), []
+    for columns, pred in zip(made, preds, strict=True):
+        S, top, outputs, _ = columns.whole.shape
+        each = np.zeros((S, top, outputs, n), complex)
         for j in range(n):
-            lost[j, ..., j] = (pred.plane.s[:top] ** 2) * pred.U[:, :top, j]
-        columns.append(made.replaced({p + j: lost[j] for j in range(n)}))
-    H, b = normal_equations(problem, columns, preds, result.weights)
-    H = H + np.diag(np.concatenate([prior, np.zeros(n)]))
-    covariance = inverse(H, RIDGE)
-    own = (covariance @ b)[p:]
-    std = np.sqrt(max(result.chi2_per_dof, 1.0) * np.diag(covariance)[p:])
+            each[..., j, j] = (pred.plane.s[:top] ** 2) * pred.U[:, :top, j]
+        lost.append(each)
+    curvature, slope = left_beside(problem, result, preds, made, lost)
+    covariance = inverse(curvature, RIDGE)
+    own = covariance @ slope
+    std = np.sqrt(max(result.chi2_per_dof, 1.0) * np.diag(covariance))
     return agreed(own, std, LARGEST * problem.sampling.sample_time**2)
 
 

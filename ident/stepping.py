@@ -9,18 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
 
 from ident.baseline import renewed
-from ident.coordinates import prior_of
-from ident.derivatives import jacobians, normal_equations
+from ident.derivatives import jacobians
 from ident.extended import Prediction
-from ident.inverse import make_plane
+from ident.inverse import plane_at, torque_record
 from ident.problem import Problem, predictions
 from ident.time_steps import DAMPERS, TimeSteps
-from ident.torque_fit import RIDGE, Fit, inverse
+from ident.torque_fit import RIDGE, Fit, inverse, left_beside
 
 FRACTIONS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20)  # of the sample time, that a step may be
 LEAST_JOINTS = 2  # that must show it: of one it may as well be something else
@@ -67,38 +67,31 @@ def shown_steps(problem: Problem, result: Fit) -> TimeSteps | None:
         return None
     preds = predictions(problem, result.model, result.remainders)
     made = jacobians(problem, result.model, preds, exact=False)
-    _, prior = prior_of(problem, result.model)
-
-    def beside(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Size and curvature of further columns (S, K, n + M, c), by group, and what is left of their covariance."""
-        p, c = len(prior), columns[0].shape[-1]
-        wide = [m.replaced({p + i: x[..., i] for i in range(c)}) for m, x in zip(made, columns, strict=True)]
-        H, b = normal_equations(problem, wide, preds, result.weights)
-        H[:p, :p] += np.diag(prior)
-        known = inverse(H[:p, :p], RIDGE)
-        curvature = H[p:, p:] - H[p:, :p] @ known @ H[:p, p:]
-        return curvature, b[p:] - H[p:, :p] @ known @ b[:p], known
-
-    steps = [TimeSteps(problem.sampling.sample_time / k, kind) for k in FRACTIONS for kind in get_args(DAMPERS)]
-    errors = [errors_of_steps(problem, g, pred, steps) for g, pred in enumerate(preds)]
-    curvature, slope, _ = beside(errors)
-    best = int(np.argmax(2.0 * slope - np.diag(curvature)))
-    each = [x[..., best, None] * np.eye(x.shape[2])[:, :n] for x in errors]
-    curvature, slope, _ = beside(each)
+    beside = partial(left_beside, problem, result, preds, made)
+    falls: dict[TimeSteps, float] = {}
+    for kind in get_args(DAMPERS):
+        steps = [TimeSteps(problem.sampling.sample_time / k, kind) for k in FRACTIONS]
+        curvature, slope = beside([errors_of_steps(problem, g, pred, steps) for g, pred in enumerate(preds)])
+        falls |= dict(zip(steps, 2.0 * slope - np.diag(curvature), strict=True))
+    best = max(falls, key=lambda each: falls[each])
+    whole = [errors_of_steps(problem, g, pred, [best]) for g, pred in enumerate(preds)]
+    curvature, slope = beside([x * np.eye(x.shape[2])[:, :n] for x in whole])
     covariance = inverse(curvature, RIDGE)
     size = covariance @ slope
     std = np.sqrt(np.maximum(result.costs / result.counts, 1.0) * np.diag(covariance))
     told = std < 1.0 / SURE
     near = told & (np.abs(size - 1.0) < ALIKE * std + SLACK)
-    return steps[best] if np.sum(near) >= LEAST_JOINTS and 2 * np.sum(near) > np.sum(told) else None
+    return best if np.sum(near) >= LEAST_JOINTS and 2 * np.sum(near) > np.sum(told) else None
 
 
 def errors_of_steps(problem: Problem, group: int, pred: Prediction, steps: Sequence[TimeSteps]) -> np.ndarray:
     """(S, K, n + M, len(steps)) what time steps change of the outputs of a group."""
-    there, par = problem.groups[group], pred.par
-    K, bare = there.n_compared, pred.plane.output_per_position
+    there, bare = problem.groups[group], pred.plane.output_per_position
     out = []
     for each in steps:
-        plane = make_plane(pred.structure, par, replace(there, steps=each), problem.sampling)
-        out.append(np.matmul((plane.output_per_position - bare)[:K], pred.solution.Q[:, :K, :, None])[..., 0])
+        stepped = replace(there, steps=each)
+        record = torque_record(pred.par, stepped, problem.sampling)
+        plane = plane_at(pred.structure, pred.par, pred.plane.lin, stepped, record)
+        change = (plane.output_per_position - bare)[: there.n_compared]
+        out.append(np.matmul(change, pred.solution.Q[:, : there.n_compared, :, None])[..., 0])
     return np.stack(out, axis=-1)

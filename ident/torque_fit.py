@@ -308,3 +308,19 @@ def _settled(problem: Problem, last: Settled, model: Model, weights: Weights) ->
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return last
     return (model, preds, [p.solution.W for p in preds], cost) if cost < LOST * last[3] else last
+
+
+def left_beside(
+    problem: Problem, result: Fit, preds: Sequence[Prediction], made: Sequence[Columns], more: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of further columns of outputs with all coordinates of a fit free: (c, c) and (c,).
+
+    Args:
+        made: derivatives by the coordinates; more: (S, K, n + M, c), by group.
+    """
+    _, prior = prior_of(problem, result.model)
+    p, c = len(prior), more[0].shape[-1]
+    wide = [m.replaced({p + i: x[..., i] for i in range(c)}) for m, x in zip(made, more, strict=True)]
+    H, b = normal_equations(problem, wide, preds, result.weights)
+    across = H[p:, :p] @ inverse(H[:p, :p] + np.diag(prior), RIDGE)
+    return H[p:, p:] - across @ H[:p, p:], b[p:] - across @ b[:p]
