@@ -140,7 +140,7 @@ def conclude(
     others = extended_baseline(final, covariance) | ({} if rigid is None else inertia_values(rigid))
     values |= others
     undetermined += tuple(k for k, v in others.items() if not v.std < UNDETERMINED * abs(v.value))
-    description = leftover + nameless_law(result, problem.structure) if unknown and not alone else None
+    description = (leftover + nameless_law(result, problem.structure)).strip() if unknown and not alone else None
     return Verdict(
         dataset=dataset.name,
         baseline=values,

@@ -154,7 +154,7 @@ def diagnose_fully(
         rigid,
         belied,
         tones,
-        left.text,
+        left.text if left else "",
     )
     if setup.ran_away:
         names = ", ".join(setup.ran_away)
@@ -186,7 +186,7 @@ def diagnose_fully(
                 evidence_plot(problem, result.final, last, effect, i)
                 for i, effect in enumerate(named_effects(result.final))
             ),
-            *([left.plot] if verdict.residual_description else []),
+            *([left.plot] if left and verdict.residual_description else []),
         ),
         traces=torque_traces(shown, pairs),
         parameters={k: v.value for k, v in verdict.baseline.items()},

@@ -11,7 +11,7 @@ from ident.extended import Prediction
 from ident.group import Group
 from ident.motion import Motion
 from ident.output_noise import noise_covariance
-from ident.problem import Problem, predictions, residual
+from ident.problem import NOT_COMPUTED, Problem, predictions, residual
 from ident.rounds import Round
 from ident.torque_fit import Fit
 from ident.units import text_at
@@ -106,8 +106,8 @@ class Law:
     explained: float
 
 
-def find_leftover(problem: Problem, final: Fit, nameless: Round | None) -> Leftover:
-    """Where the residual of a model sits, and what it depends on.
+def find_leftover(problem: Problem, final: Fit, nameless: Round | None) -> Leftover | None:
+    """Where the residual of a model sits, and what it depends on; None where the model cannot be computed.
 
     Args:
         nameless: a law without a name that explains what ``final`` leaves. Drives that were fitted without it have taken
@@ -118,7 +118,10 @@ def find_leftover(problem: Problem, final: Fit, nameless: Round | None) -> Lefto
     if nameless is not None and nameless.explained > CLOSE:
         fit = nameless.candidates[0].fit
         fit = replace(fit, model=replace(fit.model, effects=fit.model.effects[:-1]))
-    preds = predictions(problem, fit.model, fit.remainders)
+    try:
+        preds = predictions(problem, fit.model, fit.remainders)
+    except NOT_COMPUTED:
+        return None
     found = [excess_at(problem, group, pred, j) for group, pred in zip(problem.groups, preds, strict=True)]
     motions = [pred.motion() for pred in preds]
     laws = {name: [law_of(e, x(m, j)) for e, m in zip(found, motions, strict=True)] for name, x in VARIABLES.items()}
