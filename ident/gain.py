@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
 from ident.extended import Prediction, predict
 from ident.group import Group
-from ident.model import Model
+from ident.inverse import REMAINDER_STEPS
+from ident.model import Model, along_record
+from ident.motion import Torques
 from ident.output_noise import noise_covariance
-from ident.problem import Problem
+from ident.problem import NOT_COMPUTED, Problem
 from ident.stiction import as_held, held_share
 from ident.units import common_unit
 from ident.verdict import Gain, JointGain
@@ -33,6 +35,35 @@ class Errors:
     before: np.ndarray
     after: np.ndarray
     noise: np.ndarray
+
+
+def in_recorded_motion(pred: Prediction) -> Prediction:
+    """A prediction in which each record makes that of several steady motions which its torque tells.
+
+    Under a law of the gear that bends, as a cubic one, the links may swing in two ways along one motion of the motors;
+    begun from nothing the model may find the other.
+    """
+    model, group = pred.model, pred.group
+    bent = [e.hypothesis.channel == "spring" and "bends" in e.hypothesis.options for e in model.effects]
+    if group.window is not None or not any(bent):
+        return pred
+    along = tuple(
+        replace(e, hypothesis=along_record(e.hypothesis)) if bends else e
+        for e, bends in zip(model.effects, bent, strict=True)
+    )
+    try:
+        told = predict(replace(model, effects=along), group, pred.sampling).solution
+        other = predict(model, group, pred.sampling, W=told.W, torques=told.torques, steps=REMAINDER_STEPS)
+        left, left_by_other = (np.sum(np.abs(group.observe(group.U - p.U)) ** 2, axis=(1, 2)) for p in (pred, other))
+        nearer = (left_by_other < left)[:, None, None]
+        a, b = pred.solution, other.solution
+        torques = Torques(
+            *(np.where(nearer, y, x) for x, y in zip(astuple(a.torques), astuple(b.torques), strict=True))
+        )
+        W = np.where(nearer, b.W, a.W)
+        return predict(model, group, pred.sampling, W=W, torques=torques, steps=REMAINDER_STEPS)
+    except NOT_COMPUTED:
+        return pred
 
 
 def segment_errors(
@@ -59,7 +90,7 @@ def segment_errors(
     for group in groups:
         try:
             a = predict(before, group, problem.sampling)
-            b = predict(after, group, problem.sampling)
+            b = in_recorded_motion(predict(after, group, problem.sampling))
         except FloatingPointError:
             continue
         pairs.append((a, b))

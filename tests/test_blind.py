@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import diagnose, diagnose_fully
+from ident.excitation import operating_points
 from ident.verdict import UNKNOWN
 from robot_assets.robot import load_robot
-from sim import draw_effect
+from sim import draw_effect, run_experiment
 from sim.effects import parameters_of
-from sim.experiment import draw_drives
+from sim.experiment import draw_drives, plan_experiment
 from tests.conftest import quick_experiment, small_plan, through_files
 
 STRENGTH = {"coulomb_friction": 0.4, "hardening_stiffness": 4.0}  # seen, and the joint still slips
@@ -229,3 +230,17 @@ def test_a_base_that_leans_is_no_cause_of_the_catalogue(ur10, tmp_path):
     result = diagnose_fully(through_files(replace(data, robot=ur10), tmp_path))
     assert not result.verdict.causes and result.verdict.unexplained_verdict == UNKNOWN
     assert result.candidates[0][0][:2] == ("unknown:leaning_base", "base")
+
+
+@pytest.mark.slow
+def test_a_gear_under_which_held_out_records_swing_in_two_ways_is_named(ur10, tmp_path):
+    """One of these records swings in the way that the model does not find from nothing."""
+    rng = np.random.default_rng(3)
+    hidden = draw_effect(rng, ur10, names=tuple(CASES))
+    assert hidden.name == "hardening_stiffness"
+    postures = operating_points(ur10, 3, np.random.default_rng(3))
+    plan = plan_experiment(ur10, postures, points=2, realizations=1, levels=(1.0, 0.4), seed=3)
+    verdict = diagnose(through_files(run_experiment(plan, [hidden], seed=3, drives=draw_drives(rng, ur10)), tmp_path))
+    assert [(c.effect, c.joint) for c in verdict.causes if c.probability > 0.5] == [(hidden.name, hidden.place)]
+    assert verdict.causes[0].parameters["cubic"].value == pytest.approx(parameters_of(hidden)["cubic"], rel=0.02)
+    assert verdict.gain.gap_closed > 0.8

@@ -1,12 +1,16 @@
 """Intervals of the gain: how often they hold what they are for."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from ident import gain
 from ident.diagnosis import diagnose
 from ident.gain import Errors, line_squares, mean_squares, measure_gain
+from ident.model import Effect, Model
+from ident.motion import Torques
 from ident.verdict import UNKNOWN
 from sim import parse_effect
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -116,3 +120,31 @@ def test_a_cause_that_harms_held_out_data_is_taken_back(locked, tmp_path):
     assert "predicted worse" in note
     assert not verdict.causes and verdict.unexplained_verdict == UNKNOWN
     assert verdict.gain.before == verdict.gain.after
+
+
+def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(monkeypatch):
+    """Of two records one is met by a start from nothing, and one by a start from what the recorded torque says."""
+    measured = np.zeros((2, 3, 1), complex)
+    group = SimpleNamespace(U=measured, window=None, observe=lambda X: X)
+    law = SimpleNamespace(channel="spring", options={"bends": lambda p, f, k: p * f})
+    model = Model(None, None, (Effect(law, np.array([1.0])),))
+    monkeypatch.setattr(gain, "along_record", lambda h: SimpleNamespace(channel="spring", options={"along": True}))
+
+    def predicted(model, off):
+        """Off by so much in each record; of states by which the start of the next prediction is told."""
+        state = np.array(off)[:, None, None] * np.ones((2, 3, 1))
+        solution = SimpleNamespace(W=state, torques=Torques(spring=state))
+        return SimpleNamespace(model=model, group=group, sampling=None, solution=solution, U=measured + state)
+
+    def predict(model, group, sampling, *, W=None, torques=None, steps=None):
+        if "along" in model.effects[0].hypothesis.options:
+            return predicted(model, [5.0, 0.1])
+        assert W is torques.spring or np.array_equal(W, torques.spring)
+        return predicted(model, W[:, 0, 0])
+
+    monkeypatch.setattr(gain, "predict", predict)
+    found = gain.in_recorded_motion(predicted(model, [0.2, 7.0]))
+    assert found.U[:, 0, 0].real == pytest.approx([0.2, 0.1])
+    linear = replace(model, effects=())
+    start = predicted(linear, [0.2, 7.0])
+    assert gain.in_recorded_motion(start) is start
