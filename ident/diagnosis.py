@@ -35,7 +35,7 @@ from ident.model import Effect
 from ident.next_experiment import separating_experiment
 from ident.parallel import Workers, one_thread_each
 from ident.period_checks import unrepeated
-from ident.problem import NOT_COMPUTED, predictions
+from ident.problem import NOT_COMPUTED, Problem, predictions
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, carried_over, fit_rigid
 from ident.stepping import with_steps
@@ -267,19 +267,24 @@ def beside_steps(setup: Setup, baseline: Fit, max_causes: int, workers: Workers)
     """Causes of what the baseline leaves; beside the time steps of a simulation that made the records, where a model
     with some of them shows these and the baseline was too far from the data for that."""
 
+    shown: list[Problem] = []
+
     def shows_steps(fit: Fit) -> bool:
         try:
-            return bool(fit.model.effects) and with_steps(setup.problem, fit)[0] is not setup.problem
+            stepped = with_steps(setup.problem, fit)[0] if fit.model.effects else setup.problem
         except NOT_COMPUTED:
             return False
+        if stepped is not setup.problem:
+            shown.append(stepped)
+        return bool(shown)
 
     result = attribute(setup.problem, baseline, max_causes=max_causes, until=shows_steps, workers=workers)
-    if workers.late or not shows_steps(result.final):
+    if not shown or workers.late:
         return setup, baseline, result
     workers.say("time steps of a simulation")
-    setup = with_steps_of(setup, with_steps(setup.problem, result.final)[0])
-    baseline = fit_baseline(setup.problem, workers.say)
-    return setup, baseline, attribute(setup.problem, baseline, max_causes=max_causes, workers=workers)
+    first = fit_baseline(shown[-1], workers.say)
+    again = attribute(shown[-1], first, max_causes=max_causes, workers=workers)
+    return with_steps_of(setup, shown[-1]), first, again
 
 
 def under_noise_seen(
