@@ -78,7 +78,6 @@ def conclude(
     rigid: RigidFit | None = None,
     belied: Collection[tuple[str, str]] = (),
     tones: Sequence[Tone] = (),
-    leftover: str = "",
 ) -> Verdict:
     """Put the result into the words and numbers of verdict.json.
 
@@ -86,7 +85,6 @@ def conclude(
         baseline: the first model, and ``first`` what it predicts.
         belied: causes, by ``key``, that held-out data deny (``trust.denied``).
         tones: what does not repeat with the period. Where nothing else is found it is an unknown cause.
-        leftover: where and how what is left over sits (``leftover.find_leftover``).
         rigid: inertias of the links where they were found too: ``result`` is then about the model with them.
     """
     final = result.final
@@ -140,7 +138,6 @@ def conclude(
     others = extended_baseline(final, covariance) | ({} if rigid is None else inertia_values(rigid))
     values |= others
     undetermined += tuple(k for k, v in others.items() if not v.std < UNDETERMINED * abs(v.value))
-    description = (leftover + nameless_law(result, problem.structure)).strip() if unknown and not alone else None
     return Verdict(
         dataset=dataset.name,
         baseline=values,
@@ -157,7 +154,6 @@ def conclude(
         next_experiment=separating.text if separating else advice(causes, unknown, len(dataset.joints)),
         sentence=sentence(causes, unknown, detected, gain),
         unidentified=undetermined,
-        residual_description=description,
         notes=(
             *(() if rigid is None else (inertia_note(rigid, baseline, result),)),
             *(few_note(final) if few and causes else ()),

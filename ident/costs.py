@@ -10,8 +10,7 @@ from ident.errors_in_variables import scatter_costs
 from ident.extended import Prediction
 from ident.group import Group
 from ident.model import Model, joints_along_record
-from ident.noise import residual_covariance
-from ident.output_noise import noise_of_laws
+from ident.output_noise import noise_of_laws, noise_of_samples
 from ident.parallel import map_threads
 from ident.problem import Problem, Weights, by_joint, output_error, record_count
 from ident.stiction import as_held, held_share
@@ -98,13 +97,7 @@ def absorbed(problem: Problem, preds: Sequence[Prediction], weights: Weights) ->
         share, n = held_share(pred, group), problem.structure.n
         if share is None:
             return np.zeros(whiten.shape[1])
-        S = residual_covariance(
-            group,
-            pred.sampled_impedance,
-            tau_std=problem.tau_std,
-            q_std=problem.q_std,
-            samples=problem.samples(group),
-        )
+        S = noise_of_samples(problem, group, pred)
         W = whiten[:, :, :n]
         return record_count(group) * np.einsum("kij,kjl,kil->i", W, S - as_held(S, share), W.conj(), optimize=True).real
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ident.attribute import Attribution, attribute
 from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed
-from ident.conclude import conclude, named_effects, roll_off_note, step_note
+from ident.conclude import conclude, named_effects, nameless_law, roll_off_note, step_note
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, ratio_interval, segment_errors
@@ -139,23 +139,14 @@ def diagnose_fully(
     separating = separating_experiment(problem, result)
     belied = {r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)}
     tones = tones_of(recorded, last)
-    left = find_leftover(problem, result.final, result.nameless)
     verdict = conclude(
-        dataset,
-        problem,
-        setup.steps,
-        baseline,
-        result,
-        gain,
-        first,
-        last,
-        late,
-        separating,
-        rigid,
-        belied,
-        tones,
-        left.text if left else "",
+        dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied, tones
     )
+    left = None
+    if verdict.unexplained_verdict == UNKNOWN and result.detected:  # tones alone are told by themselves
+        left = find_leftover(problem, result.final, result.nameless)
+        told = (left.text if left else "") + nameless_law(result, problem.structure)
+        verdict = replace(verdict, residual_description=told.strip())
     if setup.ran_away:
         names = ", ".join(setup.ran_away)
         notes.append(
@@ -186,7 +177,7 @@ def diagnose_fully(
                 evidence_plot(problem, result.final, last, effect, i)
                 for i, effect in enumerate(named_effects(result.final))
             ),
-            *([left.plot] if left and verdict.residual_description else []),
+            *([] if left is None else [left.plot]),
         ),
         traces=torque_traces(shown, pairs),
         parameters={k: v.value for k, v in verdict.baseline.items()},

@@ -56,6 +56,8 @@ def in_recorded_motion(pred: Prediction) -> Prediction:
         other = predict(model, group, pred.sampling, W=told.W, torques=told.torques, steps=REMAINDER_STEPS)
         left, left_by_other = (np.sum(np.abs(group.observe(group.U - p.U)) ** 2, axis=(1, 2)) for p in (pred, other))
         nearer = (left_by_other < left)[:, None, None]
+        if not np.any(nearer):
+            return pred
         a, b = pred.solution, other.solution
         torques = Torques(
             *(np.where(nearer, y, x) for x, y in zip(astuple(a.torques), astuple(b.torques), strict=True))

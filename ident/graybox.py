@@ -237,8 +237,8 @@ def impedance(
     A = square[:, None, None] * lin.M + lin.Kg
     diag = np.arange(structure.n_coordinates)
     A[:, diag, diag] += K + rate[:, None] * D
-    if apart := 0.0 if steps is None else steps.apart:
-        A[:, diag, diag] += apart * square[:, None] * D
+    if steps is not None:
+        A[:, diag, diag] += steps.apart * square[:, None] * D
     A_inv = np.linalg.inv(A)
     C = par.stiffness + rate[:, None] * par.damping
     Z = -C[:, :, None] * A_inv[:, driven[:, None], driven] * C[:, None, :]

@@ -26,10 +26,19 @@ RANK = 1e-3  # of the largest singular value, below which a law is not determine
 SHOWN_WEIGHT = 0.99  # of the window of a motion, from which it is shown
 SHOWN = 1500  # samples in a picture
 VARIABLES: dict[str, Callable[[Motion, int], np.ndarray]] = {
-    "motor velocity, rad/s": Motion.v,
-    "motor position, rad": Motion.q,
-    "gear deflection, rad": Motion.delta,
-    "recorded torque, N m": Motion.torque,
+    "v": Motion.v,
+    "q": Motion.q,
+    "delta": Motion.delta,
+    "torque": Motion.torque,
+}
+LABELS = {
+    "v": "motor velocity, rad/s",
+    "q": "motor position, rad",
+    "delta": "gear deflection, rad",
+    "time": "time, s",
+    "torque": "recorded torque, N m",
+    "posture": "measured torque beyond gravity and baseline, N m",
+    "frequency": "frequency, Hz",
 }
 
 
@@ -135,7 +144,7 @@ def find_leftover(problem: Problem, final: Fit, nameless: Round | None) -> Lefto
     band = f"between {low:.3g} and {high:.3g} Hz" if high > 0.0 else "while nothing moves"
     text = (
         f"The residual torque sits mostly at {joint}, {band}{law};"
-        f" {best.split(',')[0]} explains {shares[best]:.0%} of it."
+        f" {LABELS[best].split(',')[0]} explains {shares[best]:.0%} of it."
     )
     x, y, error = (np.concatenate([getattr(law, k) for law in laws[best]]) for k in ("x", "y", "error"))
     step = max(1, x.size // SHOWN)
@@ -143,7 +152,9 @@ def find_leftover(problem: Problem, final: Fit, nameless: Round | None) -> Lefto
     order = np.argsort(x)
     shown = text_at(f"residual torque of {joint} beyond noise, N m", linear)
     title = f"What no effect explains at {joint}"
-    return Leftover(text, EvidencePlot(None, title, text_at(best, linear), shown, x, y + error, x[order], y[order]))
+    return Leftover(
+        text, EvidencePlot(None, title, text_at(LABELS[best], linear), shown, x, y + error, x[order], y[order])
+    )
 
 
 def excess_at(problem: Problem, group: Group, prediction: Prediction, joint: int) -> Excess:

@@ -23,13 +23,7 @@ def noise_covariance(
     Args:
         of_laws: of ``noise_of_laws``, where it is known already.
     """
-    S = residual_covariance(
-        group,
-        prediction.sampled_impedance,
-        tau_std=problem.tau_std,
-        q_std=problem.q_std,
-        samples=problem.samples(group),
-    )
+    S = noise_of_samples(problem, group, prediction)
     of_record = record_noise(prediction, group)
     if of_record is None:
         S = S + (noise_of_laws(prediction, group) if of_laws is None else of_laws)[: group.n_compared]
@@ -38,6 +32,17 @@ def noise_covariance(
     if group.rounding is not None:
         S += white_covariance(prediction.sampled_impedance[: group.n_compared], 0.0, group.rounding[:, None])
     return S
+
+
+def noise_of_samples(problem: Problem, group: Group, prediction: Prediction) -> np.ndarray:
+    """(K, n, n) of it, what noise of the torque and of the position are in the linear arm."""
+    return residual_covariance(
+        group,
+        prediction.sampled_impedance,
+        tau_std=problem.tau_std,
+        q_std=problem.q_std,
+        samples=problem.samples(group),
+    )
 
 
 def noise_of_laws(prediction: Prediction, group: Group) -> np.ndarray:

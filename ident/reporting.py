@@ -12,6 +12,7 @@ from ident.dataset import Dataset, Segment
 from ident.extended import Prediction, predict
 from ident.frf import estimate_frf
 from ident.group import Group
+from ident.leftover import LABELS, SHOWN_WEIGHT, VARIABLES
 from ident.model import Effect, Model
 from ident.output_noise import noise_covariance
 from ident.problem import Problem, output_error, residual
@@ -23,7 +24,6 @@ from robot_assets.robot import linear_joints
 
 BANDS = 8
 SHOWN_SECONDS = 6.0  # of a period
-SHOWN_WEIGHT = 0.99  # of the window of a motion, from which it is shown
 
 
 def where(problem: Problem, fit: Fit, predictions: Sequence[Prediction], least: float = 0.05) -> tuple[Where, ...]:
@@ -141,17 +141,6 @@ def torque_traces(groups: Sequence[Group], pairs: Sequence[tuple[Prediction, Pre
     return tuple(out)
 
 
-LABELS = {
-    "v": "motor velocity, rad/s",
-    "q": "motor position, rad",
-    "delta": "gear deflection, rad",
-    "time": "time, s",
-    "torque": "recorded torque, N m",
-    "posture": "measured torque beyond gravity and baseline, N m",
-    "frequency": "frequency, Hz",
-}
-
-
 def evidence_plot(
     problem: Problem, fit: Fit, predictions: Sequence[Prediction], effect: Effect, cause: int
 ) -> EvidencePlot:
@@ -177,9 +166,8 @@ def evidence_plot(
             X = (outputs - without.outputs())[..., row : row + 1]
             X[:, band] = 0.0
             curves.append(group.to_time(X)[..., 0])
-        of_joint = {"v": motion.v, "q": motion.q, "delta": motion.delta, "torque": motion.torque}
-        if h.variable in of_joint:
-            variable = of_joint[h.variable](j)
+        if h.variable in VARIABLES:
+            variable = VARIABLES[h.variable](motion, j)
         else:
             variable = motion.time if h.variable == "time" else curves[1]
         # A motion is closed by a return that nobody recorded.

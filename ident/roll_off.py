@@ -21,7 +21,7 @@ SURE = 5.0  # standard deviations from nothing
 ALIKE = 4.0  # the same of a joint from what all share
 SLACK = 0.25  # of the roll-off, by which a joint may differ beside that: its model is not exact
 LARGEST = 0.1  # sample times squared
-TELLING = 0.25  # share of what a joint leaves beyond noise, that its part of the roll-off must explain
+TELLING = 0.25  # share of what a joint leaves beyond noise, that what all joints share must explain
 BY_CHANCE = 4.0  # fall of a cost by a number more, up to which noise brings it
 STEPS = 2  # from where a fit ends to where it ends with them
 
@@ -37,8 +37,13 @@ def with_roll_off(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
         sampling = problem.sampling
         problem = replace(problem, sampling=replace(sampling, roll_off=sampling.roll_off + more))
         result = renewed(problem, result)
-    explained = first.costs - result.costs > np.maximum(TELLING * (first.costs - first.counts), BY_CHANCE)
-    return (problem, result) if 2 * np.sum(explained) > len(explained) else (start, first)
+    return (problem, result) if told_by_most(first, result) else (start, first)
+
+
+def told_by_most(before: Fit, after: Fit) -> bool:
+    """Whether what a fit has beyond another explains enough of what that leaves, at most joints."""
+    explained = before.costs - after.costs > np.maximum(TELLING * (before.costs - before.counts), BY_CHANCE)
+    return 2 * int(np.sum(explained)) > len(explained)
 
 
 def shared_roll_off(problem: Problem, result: Fit) -> float:

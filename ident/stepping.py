@@ -1,7 +1,7 @@
 """Records that come from a simulation with a coarse time step, whose own error at all joints is not that of an arm.
 
 Semi-implicit Euler, as MuJoCo's ``Euler`` and ``implicitfast`` are, has second differences for accelerations and shifted
-ones for the velocities of dampers (``time_steps.TimeSteps``). With a step of 0.5 ms the noise of good sensors is far
+ones for the velocities of dampers (``time_steps.TimeSteps``). With a step of 0.5 ms the noise of good sensors may be
 below that. A step is a whole fraction of the sample time, and all joints have the same; a machine has none.
 """
 
@@ -19,6 +19,7 @@ from ident.derivatives import jacobians
 from ident.extended import Prediction
 from ident.inverse import plane_at, torque_record
 from ident.problem import Problem, predictions
+from ident.roll_off import told_by_most
 from ident.time_steps import DAMPERS, TimeSteps
 from ident.torque_fit import RIDGE, Fit, inverse, left_beside
 
@@ -27,8 +28,6 @@ LEAST_JOINTS = 2  # that must show it: of one it may as well be something else
 SURE = 5.0  # standard deviations from nothing
 ALIKE = 4.0  # the same, of a joint from a step as it is sought
 SETTLED = 1.25  # of the noise, that a joint is left with where nothing is missing there
-TELLING = 0.25  # share of what a joint leaves beyond noise, that steps must explain
-BY_CHANCE = 4.0  # fall of a cost by a number more, up to which noise brings it
 SLACK = 0.5  # of the size, by which a joint may differ beside that: its model is not exact
 
 
@@ -46,9 +45,8 @@ def with_steps(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
 def told_by(before: Fit, after: Fit) -> bool:
     """Whether a fit in time steps explains what one without leaves, at most joints, and leaves hardly more than noise
     there."""
-    explained = before.costs - after.costs > np.maximum(TELLING * (before.costs - before.counts), BY_CHANCE)
     settled = after.costs <= SETTLED * after.counts
-    return 2 * int(np.sum(explained)) > len(explained) and 2 * int(np.sum(settled)) > len(settled)
+    return told_by_most(before, after) and 2 * int(np.sum(settled)) > len(settled)
 
 
 def in_steps(problem: Problem, steps: TimeSteps) -> Problem:
