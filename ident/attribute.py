@@ -57,10 +57,18 @@ LAWS_LEAVE = 1e-4
 
 @dataclass(frozen=True)
 class Attribution:
-    """Result: the baseline fit, rounds, and the final fit."""
+    """Result: the baseline fit, rounds, and the final fit.
+
+    Attributes:
+        detected: whether there is a discrepancy: clear, or one that noise as a whole hides and a cause explains.
+        clear: whether the baseline leaves more than noise as a whole or anywhere loudly.
+        p_value: of the discrepancy by noise alone.
+        unknown: whether something without a name explains what no cause does.
+    """
 
     baseline: Fit
     detected: bool
+    clear: bool
     p_value: float
     rounds: tuple[Round, ...]
     final: Fit
@@ -70,6 +78,12 @@ class Attribution:
     def left_share(self) -> float:
         """Share of the discrepancy (excess over noise) that no cause explains."""
         return left_share(self.baseline, self.final)
+
+    def without_causes(self) -> Attribution:
+        """What is left of the result where its causes are refuted: an unknown cause of a clear discrepancy, and
+        nothing where they alone had shown one."""
+        p_value = discrepancy_p_value(self.baseline)
+        return replace(self, detected=self.clear, p_value=p_value, rounds=(), final=self.baseline, unknown=self.clear)
 
     @property
     def nameless(self) -> Round | None:
@@ -173,7 +187,9 @@ def attribute(
     left = {e.hypothesis.key for e in current.model.effects}
     kept = tuple(r for r in rounds if r.candidates[0].hypothesis.decoy or r.candidates[0].hypothesis.key in left)
     unknown = search.unknown or any(outdone(r) and told_share(baseline, r) > LEFT_TO_DECOYS for r in kept)
-    return Attribution(baseline, clear or bool(kept), search.p_value if kept else p_value, kept, current, unknown)
+    return Attribution(
+        baseline, clear or bool(kept), clear, search.p_value if kept else p_value, kept, current, unknown
+    )
 
 
 def next_round(task: Task, search: Search) -> Search:

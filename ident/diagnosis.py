@@ -117,10 +117,10 @@ def diagnose_fully(
     problem = setup.problem
     say("gain on held-out data")
     first = predictions(problem, baseline.model, baseline.remainders)
-    affected = affected_joints(problem, baseline, first) if result.detected else ()
     method = "validation segments" if dataset is given else "the end of the only motion, held out"
 
     def tested(found: Attribution) -> HeldOut:
+        affected = affected_joints(problem, baseline, first) if found.detected else ()
         return held_out(setup, nominal, baseline, found, rigid is not None, affected, method, workers)
 
     gain, shown, pairs = tested(result)
@@ -131,7 +131,7 @@ def diagnose_fully(
             f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
             f" {gain.before:.3g} {torque_unit(dataset.robot, gain.joints)}."
         )
-        result, rigid = replace(result, rounds=(), final=baseline, unknown=True), None
+        result, rigid = result.without_causes(), None
         gain, shown, pairs = tested(result)
     say("evidence")
     last = predictions(problem, result.final.model, result.final.remainders)

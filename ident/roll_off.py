@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.baseline import renewed
+from ident.baseline import DETECTION_EXCESS, renewed
 from ident.derivatives import jacobians
 from ident.problem import Problem, predictions
 from ident.torque_fit import RIDGE, Fit, inverse, left_beside
@@ -42,7 +42,8 @@ def with_roll_off(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
 
 def told_by_most(before: Fit, after: Fit) -> bool:
     """Whether what a fit has beyond another explains enough of what that leaves, at most joints."""
-    explained = before.costs - after.costs > np.maximum(TELLING * (before.costs - before.counts), BY_CHANCE)
+    left = before.costs - DETECTION_EXCESS * before.counts  # a little more may be noise that is known too small
+    explained = before.costs - after.costs > np.maximum(TELLING * left, BY_CHANCE)
     return 2 * int(np.sum(explained)) > len(explained)
 
 

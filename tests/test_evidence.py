@@ -656,7 +656,7 @@ def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():
         )
 
     chain, own = (SimpleNamespace(on_chain=x, joint=1) for x in (True, False))
-    faint = Attribution(fit(1.02, 1.05, 1.15), True, 0.0, (), fit(1.0, 1.0, 1.15), False)
+    faint = Attribution(fit(1.02, 1.05, 1.15), True, False, 0.0, (), fit(1.0, 1.0, 1.15), False)
     assert left_of(chain, faint) == 0.0
     strong = replace(faint, baseline=fit(9.0, 3.0, 1.15), final=fit(1.1, 1.35, 1.15))
     assert left_of(own, strong) == pytest.approx(0.25 / 2.0)
@@ -1196,7 +1196,7 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     data, setup, result = identified
     problem = setup.problem
     preds = predictions(problem, result.model, result.remainders)
-    quiet = Attribution(result, False, 1e-14, (), result, False)
+    quiet = Attribution(result, False, False, 1e-14, (), result, False)
     assert any("p = 1e-14" in note for note in conclude(data, problem, (), result, quiet, None, preds, preds).notes)
     h = named["hysteresis", "elbow_joint"]
     final = refit(
@@ -1207,7 +1207,7 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     )
     worse = replace(result, costs=1e3 * result.costs)
     found = Round(worse, (Candidate(h, final, 0.0, 1.0),), (), 1.0, 1.0)
-    heard = Attribution(worse, True, 0.0, (found,), final, False)
+    heard = Attribution(worse, True, True, 0.0, (found,), final, False)
     given = []
     for there in (True, False):
         monkeypatch.setattr("ident.conclude.shown", lambda *args, there=there: there)
@@ -1257,7 +1257,7 @@ def test_what_is_no_chance_and_yet_no_discrepancy_is_said():
     left = SimpleNamespace(chi2_per_dof=1.07)
 
     def notes(detected: bool, p_value: float) -> tuple[str, ...]:
-        return faint_note(Attribution(left, detected, p_value, (), left, False))
+        return faint_note(Attribution(left, detected, detected, p_value, (), left, False))
 
     (said,) = notes(False, 1e-14)
     assert "1.07 times" in said and "p = 1e-14" in said

@@ -375,12 +375,26 @@ def test_a_diagnosis_asks_held_out_data_about_its_causes(clean, identified, hypo
 
     monkeypatch.setattr("ident.diagnosis.identify", lambda *args, **rest: (setup, baseline))
     monkeypatch.setattr(
-        "ident.diagnosis.attribute", lambda *args, **rest: Attribution(baseline, True, 0.0, (found,), final, False)
+        "ident.diagnosis.attribute",
+        lambda *args, **rest: Attribution(baseline, True, True, 0.0, (found,), final, False),
     )
     monkeypatch.setattr("ident.diagnosis.denied", deny)
     verdict = diagnose(clean[0])
     assert asked == [(setup.held_out, found)]
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
+
+
+@pytest.mark.parametrize("clear", [True, False])
+def test_refuted_causes_leave_an_unknown_one_only_of_a_discrepancy_that_is_seen_without_them(identified, clear):
+    """Where they alone had shown one there is none."""
+    baseline = identified[2]
+    found = Attribution(
+        baseline, True, clear, 1e-30, (SimpleNamespace(),), replace(baseline, costs=0.0 * baseline.costs), False
+    )
+    left = found.without_causes()
+    assert (left.detected, left.unknown) == (clear, clear)
+    assert left.rounds == () and left.final is baseline
+    assert left.p_value == discrepancy_p_value(baseline)
 
 
 @pytest.mark.parametrize(("wrong", "right", "expected"), [

@@ -209,7 +209,7 @@ def test_friction_is_named_beside_links_that_differ_from_their_description(moved
 def test_inertias_that_do_worse_than_the_description_are_left_at_once(moved, monkeypatch, left, sought):
     """Where the first model with them leaves more than that without, causes are not sought beside them."""
     setup, first = identify(moved)
-    found = Attribution(first, True, 0.0, (), first, True)
+    found = Attribution(first, True, True, 0.0, (), first, True)
     worse = replace(first, costs=left * first.costs)
     asked = []
     monkeypatch.setattr("ident.diagnosis.fit_baseline", lambda *args: worse)

@@ -1,5 +1,7 @@
 """Records of a simulation with a coarse time step: its error is known, and is no cause."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from ident.chain import build_structure
 from ident.diagnosis import diagnose
 from ident.graybox import Parameters, equilibrium, impedance, linearise
 from ident.identification import identify
+from ident.roll_off import told_by_most
 from ident.stepping import shown_steps
 from ident.time_steps import TimeSteps, differences
 from sim import parse_effect
@@ -65,6 +68,16 @@ def test_the_time_step_of_a_simulation_is_found_where_it_shows(locked, tmp_path,
     assert {g.steps for g in (*setup.problem.groups, *setup.held_out)} == {steps}
     assert baseline.chi2_per_dof < 1.1
     assert shown_steps(setup.problem, baseline) is None
+
+
+@pytest.mark.parametrize(("left", "told"), [(1.08, True), (1.5, False)])
+def test_what_joints_share_need_not_explain_noise_that_is_known_too_small(left, told):
+    """Of a tenth more than noise as it is known, it explains a little at all joints; of more that has other causes, too
+    little."""
+    counts = np.full(6, 1e4)
+    before = SimpleNamespace(costs=left * counts, counts=counts)
+    assert told_by_most(before, SimpleNamespace(costs=left * counts - 50.0, counts=counts)) == told
+    assert not told_by_most(before, before)
 
 
 def test_a_cause_in_records_of_coarse_steps_is_named_alone(locked, tmp_path):
