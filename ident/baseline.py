@@ -13,6 +13,7 @@ from ident.graybox import Parameters
 from ident.model import Effect, Model
 from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
+from robot_assets.robot import guessed_drives
 
 DETECTION_EXCESS = 1.10  # chi2 per degree of freedom up to which the estimate of the noise may be short of it
 FAINT = 3.0  # chi2 per degree of freedom up to which what is left is searched from linear steps that keep the data
@@ -24,6 +25,7 @@ DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive amo
 ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
+GUESSED = 20.0  # the same where that follows from the bodies that a joint carries, within a factor of about five
 LAST_STEPS = 8  # at most, under the noise that the baseline sees itself
 RENEWALS = 3  # at most, of that noise
 # natural logarithm of a drive figure, up to which a fit has moved so little that its noise is its own
@@ -137,7 +139,9 @@ def implausible(problem: Problem, result: Fit, joints: Sequence[int] | None = No
     n, x = problem.structure.n, result.model.par.to_log() - problem.nominal.to_log()
     drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
     known = np.sqrt(np.maximum(np.diag(result.covariance())[drives], 0.0)) < UNDETERMINED
-    limit = np.log(IMPLAUSIBLE)
+    robot = problem.structure.robot
+    guessed = np.isin(robot.joint_names, guessed_drives(robot))
+    limit = np.log(np.where(np.tile(guessed, 2), GUESSED, IMPLAUSIBLE))
     # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
     # its link: there the gears take up what else is wrong, and only a motor that is known tells.
     low = x[drives] < -limit

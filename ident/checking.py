@@ -24,7 +24,7 @@ from ident.period_checks import period_warnings
 from ident.rest import difference_noise
 from ident.skew_checks import skew_warnings
 from ident.torque_checks import torque_warnings
-from robot_assets.robot import linear_joints
+from robot_assets.robot import guessed_drives, linear_joints
 
 CHECKS = (
     filled_warnings,
@@ -48,6 +48,7 @@ class Report:
 
     Attributes:
         channels: channel -> joints (from 1) that have it. hold: how torque is taken between samples.
+        guessed_drives: joints of which a stiffness or motor inertia is a guess.
         q_range, tau_range: (n, 2) smallest and largest value. limits: (n, 2) of the position.
     """
 
@@ -73,6 +74,7 @@ class Report:
     limits: tuple[tuple[float, float], ...]
     torque_limits: tuple[float, ...]
     files: tuple[str, ...]
+    guessed_drives: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON holds it."""
@@ -95,6 +97,8 @@ class Report:
             rows.append(
                 f"operating points {len(self.operating_points)}, levels {list(self.levels)}, {self.lines} excited lines up to {self.highest_hz:.4g} Hz"
             )
+        if self.guessed_drives:
+            rows.append(f"starting guesses, not known: drives of {', '.join(self.guessed_drives)}")
         rows += [f"  {line}" for line in self.files]
         for j, name in enumerate(self.joints):
             m, newton = self.units[j]
@@ -138,6 +142,7 @@ def inspect_dataset(dataset: Dataset) -> Report:
         limits=tuple((float(a), float(b)) for a, b in zip(robot.q_min, robot.q_max)),
         torque_limits=tuple(float(x) for x in robot.array("torque_limit")),
         files=tuple(_line(s, dataset.sample_rate) for s in segments) if len(segments) <= SHOWN else (),
+        guessed_drives=guessed_drives(robot),
     )
 
 

@@ -46,6 +46,7 @@ from ident.torque_fit import Fit
 from ident.trust import LEFT_ERROR, denied, known_probability
 from ident.units import torque_unit, units_of_torques
 from ident.verdict import LEFT_OUT, UNKNOWN, Diagnosis, Gain, Verdict
+from robot_assets.robot import guessed_drives
 
 # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
 LEFT_BY_BOTH = 0.1
@@ -155,6 +156,8 @@ def diagnose_fully(
     if cut:
         notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
     notes += [f"Not used: {line}." for line in not_fitted(given)]
+    if guessed := guessed_drives(dataset.robot):
+        notes.append(f"The drives of {', '.join(guessed)} were fitted from guesses: robot.toml does not know them.")
     if problem.steps is not None:
         notes.append(step_note(problem.steps))
     if problem.sampling.roll_off:

@@ -9,13 +9,15 @@ from __future__ import annotations
 import os
 import re
 import sysconfig
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robot_assets.errors import DataError
+from robot_assets.guesses import guess_joints
+from robot_assets.joint import ENCODER, NOISE, VELOCITY, WINDUP, Joint
 from robot_assets.spelling import NAMES, joint_tables
 from robot_assets.urdf import Description, read_urdf
 from robot_assets.values import MISSING, exists, number, read_toml, show, subtable, tables, text, vector
@@ -32,37 +34,8 @@ OTHER_NAMES = {
     "q_std": ("q_noise_std",),
     "tau_std": ("tau_noise_std",),
 }
+OF_DRIVE = ("gear_ratio", "motor_inertia", "stiffness", "damping", "viscous_friction")
 DRIVE = re.compile(rf"(?m)^[ \t]*\[\[[ \t]*(?:{'|'.join(NAMES)})[ \t]*\]\]")  # begins the table of one
-# Guesses of what a robot.toml may leave out; by whether a joint is linear.
-WINDUP = 1 / 150  # rad: how far a gear winds up under the torque limit
-VELOCITY = {False: np.pi, True: 1.0}  # velocity limit where the URDF has none, rad/s or m/s
-ENCODER = {False: 3e-6, True: 1e-6}  # position noise, rad or m
-NOISE = 1e-4  # torque noise over the torque limit
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A driven joint.
-
-    Attributes:
-        gear_ratio: motor turns per joint turn.
-        motor_inertia: kg m2. stiffness: N m/rad. damping, viscous_friction: N m s/rad.
-        torque_limit: N m. velocity_limit: rad/s. q_std: encoder noise, rad. tau_std: N m.
-
-    A linear joint has kg, N and m in the place of kg m2, N m and rad. Limits that ``robot.toml`` does not give are those
-    of the URDF, else guesses, as is noise.
-    """
-
-    name: str
-    gear_ratio: float
-    motor_inertia: float
-    stiffness: float
-    damping: float
-    viscous_friction: float
-    torque_limit: float
-    velocity_limit: float
-    q_std: float
-    tau_std: float
 
 
 @dataclass(frozen=True)
@@ -94,7 +67,13 @@ class Load:
 
 @dataclass(frozen=True)
 class Robot:
-    """An arm. ``locked`` names URDF joints that do not move, with their position (rad or m)."""
+    """An arm.
+
+    Attributes:
+        locked: URDF joints that do not move, with their position, rad or m.
+        guessed: figure of a drive -> joints of which it is a guess: ``robot.toml`` does not give it, or still marks it
+            GUESS in the comment beside it, as ``simgap robot`` writes it.
+    """
 
     name: str
     folder: Path
@@ -109,6 +88,7 @@ class Robot:
     q_min: np.ndarray
     q_max: np.ndarray
     description: str = ""
+    guessed: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def n(self) -> int:
@@ -140,15 +120,22 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     data = read_toml(path, "robot")
     urdf, mesh_dir = _urdf(data.get("urdf"), folder, where)
     tree = read_urdf(urdf)
-    joints = tuple(_joint(entry, i, where, tree) for i, entry in enumerate(joint_tables(data, where)))
-    if not joints:
+    entries = joint_tables(data, where)
+    if not entries:
         raise DataError("[[joint]]", where, "none", "at least one driven joint")
-    names = [j.name for j in joints]
+    names = [text(entry, "name", f"{where} joint {i + 1}") for i, entry in enumerate(entries)]
     locked = subtable(data, "locked", where)
     _distinct([*names, *locked], "[[joint]] and [locked] names", where)
     for name in [*names, *locked]:
         if name not in tree.limits:
             raise DataError("joint", where, name, f"a movable joint of {urdf.name}: {sorted(tree.limits)}")
+    locked_at = {name: number(locked, name, where) for name in locked}
+    bare = [not any(_given(entry, figure) for figure in OF_DRIVE[1:]) for entry in entries]
+    guesses = [g.joint for g in guess_joints(urdf, tree, names, locked_at)] if any(bare) else [None] * len(names)
+    joints = tuple(
+        _joint(entry, where, tree, guess if nothing else None)
+        for entry, guess, nothing in zip(entries, guesses, bare, strict=True)
+    )
     hinges = tuple(_elasticity(e, where, names) for e in tables(data, "elasticity", where))
     _distinct([h.name for h in hinges], "[[elasticity]] names", where)
     payload_link = data.get("payload_link", data.get("flange", tree.child[names[-1]]))
@@ -162,13 +149,14 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
         joints=joints,
         elasticities=hinges,
         loads=tuple(_load(e, where, tree.links) for e in tables(data, "load", where)),
-        locked={name: number(locked, name, where) for name in locked},
+        locked=locked_at,
         gravity=(float(gx), float(gy), float(gz)),
         mesh_dir=mesh_dir,
         payload_link=payload_link,
         q_min=np.array([tree.limits[n][0] for n in names]),
         q_max=np.array([tree.limits[n][1] for n in names]),
         description=str(data.get("description", "")),
+        guessed=_guessed(path, names, entries),
     )
 
 
@@ -184,11 +172,10 @@ def linear_joints(robot: Robot) -> np.ndarray:
     return np.array([kinds[name] == "prismatic" for name in robot.joint_names])
 
 
-def guessed_joints(robot: Robot, key: str) -> tuple[str, ...]:
-    """Joints of which a figure is still marked GUESS in the comment beside it, as ``simgap robot`` writes it."""
-    marked = re.compile(rf"(?m)^[ \t]*({'|'.join((key, *OTHER_NAMES.get(key, ())))})[ \t]*=[^#\n]*#.*\bGUESS\b")
-    drives = DRIVE.split((robot.folder / "robot.toml").read_text(encoding="utf-8-sig"))[1:]
-    return tuple(name for name, drive in zip(robot.joint_names, drives, strict=False) if marked.search(drive))
+def guessed_drives(robot: Robot) -> tuple[str, ...]:
+    """Joints of which the stiffness or the motor inertia is a guess."""
+    unknown = {*robot.guessed["stiffness"], *robot.guessed["motor_inertia"]}
+    return tuple(name for name in robot.joint_names if name in unknown)
 
 
 def robot_reference(robot: Robot, folder: Path) -> str:
@@ -236,12 +223,38 @@ def _distinct(names: list[str], what: str, where: str) -> None:
         raise DataError(what, where, f"{double[0]} twice", "distinct names")
 
 
-def _joint(entry: dict, i: int, where: str, tree: Description) -> Joint:
-    name = text(entry, "name", f"{where} joint {i + 1}")
-    where, linear = f"{where} joint {name}", tree.kinds.get(name) == "prismatic"
+def _given(entry: dict, figure: str) -> list[str]:
+    """The names by which the table of a joint gives a figure."""
+    return [name for name in (figure, *OTHER_NAMES.get(figure, ())) if name in entry]
+
+
+def _guessed(path: Path, names: list[str], entries: list[dict]) -> dict[str, tuple[str, ...]]:
+    drives = DRIVE.split(path.read_text(encoding="utf-8-sig"))[1:]
+    drives += [""] * (len(names) - len(drives))
+
+    def marked(figure: str) -> re.Pattern[str]:
+        aliases = "|".join((figure, *OTHER_NAMES.get(figure, ())))
+        return re.compile(rf"(?m)^[ \t]*({aliases})[ \t]*=[^#\n]*#.*\bGUESS\b")
+
+    return {
+        figure: tuple(
+            name
+            for name, entry, drive in zip(names, entries, drives, strict=False)
+            if not _given(entry, figure) or marked(figure).search(drive)
+        )
+        for figure in OF_DRIVE
+    }
+
+
+def _joint(entry: dict, where: str, tree: Description, guess: Joint | None) -> Joint:
+    """A joint from its table, and from ``guess`` where that says nothing of its drive: where it says some figures, one
+    that is not among them is missed."""
+    name = entry["name"]
+    where, linear = f"{where} joint {name}", tree.kinds[name] == "prismatic"
 
     def figure(key: str, default: Any = MISSING) -> float:
-        used = [name for name in (key, *OTHER_NAMES.get(key, ())) if name in entry]
+        default = default if guess is None else getattr(guess, key)
+        used = _given(entry, key)
         if len(used) > 1:
             raise DataError(used[1], where, f"{used[0]} beside it", "one of the two: they are the same")
         return number(entry, used[0] if used else key, where, low=0.0, above=True, default=default)

@@ -1,7 +1,7 @@
 """The drives of a ``robot.toml`` in the ways in which people write them down: each as the table of one joint.
 
 ``[[joint]]`` is the way of this project. What else says the same without doubt is read too: another name of the array,
-a table of each joint by its name, or lists in the order of the joints.
+a table of each joint by its name, lists in the order of the joints, or a list of the joints and their drives apart.
 """
 
 from __future__ import annotations
@@ -16,17 +16,37 @@ NOISE = ("q_std", "tau_std")
 
 
 def joint_tables(data: dict[str, Any], where: str) -> list[dict[str, Any]]:
-    """The tables of the driven joints, from the base on, each with its ``name``.
+    """The tables of the driven joints, from the base on, each with its ``name``; and no more where nothing is said of
+    the drives but whose they are.
 
     Raises:
         DataError: where the drives are written in two ways, lists differ in length, or a joint has no name.
     """
-    used = [key for key in NAMES if key in data]
-    lists = len(used) == 2 and _all(data[used[0]], str)  # the names, and a table of lists in their order
-    if len(used) > 1 and not lists:
+    listed = [key for key in NAMES if _all(data.get(key), str)]  # of joints by their names, the drives elsewhere
+    used = [key for key in NAMES if key in data and key not in listed[:1]]
+    if len(used) > 1:
         raise DataError(f"[[{used[1]}]]", where, f"[[{used[0]}]] beside it", "the drives in one place")
-    entries = _of_lists(data[used[1]], data[used[0]], where) if lists else _entries(data, used, where)
+    if listed:
+        entries = _in_order(data, data[listed[0]], used, where)
+    else:
+        entries = _entries(data, used, where)
     return _with_noise(entries, subtable(data, "noise", where), where)
+
+
+def _in_order(data: dict[str, Any], names: list[str], used: list[str], where: str) -> list[dict[str, Any]]:
+    """The tables of joints that are listed by their names, in that order."""
+    if not used:
+        return [{"name": name} for name in names]
+    drives = data[used[0]]
+    if isinstance(drives, dict) and not _all(list(drives.values()), dict):
+        return _of_lists(drives, names, where)
+    entries = _entries(data, used, where)
+    if len(entries) == len(names) and not any("name" in entry for entry in entries):
+        return [{"name": name, **entry} for name, entry in zip(names, entries, strict=True)]
+    given = [entry.get("name") for entry in entries]
+    if len(given) != len(names) or not all(given.count(name) == 1 for name in names):
+        raise DataError(f"[[{used[0]}]]", where, f"drives of {show(given)}", f"one of each of {names}")
+    return [entries[given.index(name)] for name in names]
 
 
 def _entries(data: dict[str, Any], used: list[str], where: str) -> list[dict[str, Any]]:
@@ -49,9 +69,7 @@ def _named(entry: dict[str, Any]) -> dict[str, Any]:
     return {"name": entry["joint"], **{k: v for k, v in entry.items() if k != "joint"}}
 
 
-def _of_lists(lists: Any, names: list[str], where: str) -> list[dict[str, Any]]:
-    if not isinstance(lists, dict):
-        raise DataError("drives", where, show(lists), "a table of lists in the order of the joints")
+def _of_lists(lists: dict[str, Any], names: list[str], where: str) -> list[dict[str, Any]]:
     for key, values in lists.items():
         if not isinstance(values, list) or len(values) != len(names):
             raise DataError(key, where, show(values), f"a list of {len(names)} in the order of {names}")

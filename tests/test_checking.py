@@ -465,3 +465,10 @@ def test_a_loop_need_not_follow_a_fast_reference_in_full(arm, log):
         middle = log.q.mean(axis=0)
         asked = replace(log, q_ref=middle + factor * (log.q - middle))
         assert any(w.startswith("q_ref") for w in unit_warnings(asked, dataset(arm, asked))) is told
+
+
+def test_drives_that_are_guesses_are_told(arm, log):
+    told = "starting guesses, not known: drives of elbow_joint"
+    guessed = replace(arm, guessed=arm.guessed | {"stiffness": ("elbow_joint",)})
+    assert told in inspect_dataset(dataset(guessed, log)).text()
+    assert "not known" not in inspect_dataset(dataset(arm, log)).text()

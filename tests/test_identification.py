@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.baseline import discrepancy_p_value, fit_baseline
+from ident.baseline import discrepancy_p_value, fit_baseline, implausible
 from ident.chain import build_structure
 from ident.coordinates import pack, unpack
 from ident.costs import joint_costs
@@ -353,3 +353,18 @@ def test_the_end_of_a_motion_is_held_out_where_it_is_the_only_one_to_fit(clean):
     for role, names in (("identification", ["motion", "motion-end"]), ("validation", ["motion"])):
         alone = replace(clean[0], segments=(replace(motion, name="motion", role=role),))
         assert [s.name for s in with_held_out(alone).segments] == names
+
+
+@pytest.mark.parametrize(("factor", "guessed", "expected"), [
+    (2.0, False, False),
+    (6.0, False, True),
+    (6.0, True, False),  # the bodies tell a drive only so well
+    (40.0, True, True),
+])  # fmt: skip
+def test_drives_are_implausible_far_from_what_is_known_of_them(identified, factor, guessed, expected):
+    setup, result = identified
+    problem, at = setup.problem, setup.problem.structure.robot.joint_names
+    robot = replace(problem.structure.robot, guessed={"stiffness": at * guessed, "motor_inertia": ()})
+    nominal = replace(problem.nominal, inertia=result.model.par.inertia * factor)
+    known = replace(problem, structure=replace(problem.structure, robot=robot), nominal=nominal)
+    assert implausible(known, result) == expected

@@ -172,7 +172,7 @@ def test_a_guessed_gear_ratio_that_scales_a_column_is_told(tmp_path):
 
     motor = ('q_1 = "a"', 'q_1 = { source = "a", side = "motor" }')
     (line,) = told(*motor)
-    assert line.startswith("q of turn scaled by a gear_ratio that is marked GUESS in robot.toml")
+    assert line.startswith("q of turn scaled by a gear_ratio that is a guess")
     (line,) = told(*motor, 'r_2 = { source = "d", unit = "N m", side = "motor" }')
     assert line.startswith("q, r of turn, slide scaled")
     # No ratio of the robot in it: on the link side, or of the map's own.

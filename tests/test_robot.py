@@ -1,11 +1,13 @@
 """Robot folders."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from robot_assets.errors import DataError
+from robot_assets.from_urdf import draft_robot
 from robot_assets.robot import OTHER_NAMES, load_robot
 
 
@@ -85,17 +87,19 @@ FIGURES = {"gear_ratio": (100.0, 50.0), "motor_inertia": (2.0, 1.0), "stiffness"
 FIGURES |= {"viscous_friction": (15.0, 6.0)}
 LISTS = "".join(f"{key} = {list(values)}\n" for key, values in FIGURES.items())
 EACH = tuple("".join(f"{key} = {values[i]}\n" for key, values in FIGURES.items()) for i in range(2))
+LISTED = 'joints = ["shoulder", "elbow"]\n'
 NAMED = 'names = ["shoulder", "elbow"]\n'
 
 
-def planar(folder, drives):
-    """An arm of two joints whose drives are written in some way."""
+def planar(folder, drives, efforts=(40.0, 40.0)):
+    """An arm of two joints whose drives are written in some way; ``efforts`` are limits of their torques, N m."""
     joints = "".join(
         f'<joint name="{name}" type="revolute"><parent link="l{i}"/><child link="l{i + 1}"/><axis xyz="0 0 1"/>'
-        '<limit lower="-1" upper="1" effort="40" velocity="3"/></joint>'
+        f'<limit lower="-1" upper="1" effort="{efforts[i]}" velocity="3"/></joint>'
         for i, name in enumerate(TWO)
     )
-    links = "".join(f'<link name="l{i}"/>' for i in range(3))
+    inertia = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+    links = "".join(f'<link name="l{i}"><inertial><mass value="3"/>{inertia}</inertial></link>' for i in range(3))
     (folder / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
     (folder / "robot.toml").write_text(f'urdf = "arm.urdf"\n{drives}')
     return folder
@@ -109,6 +113,9 @@ def planar(folder, drives):
         "".join(f"[joints.{name}]\n{own}" for name, own in zip(TWO, EACH, strict=True)),
         f"[drives]\n{NAMED}{LISTS}",
         f'joints = ["shoulder", "elbow"]\n[drives]\n{LISTS}',
+        LISTED + "".join(f'[[drive]]\njoint = "{TWO[i]}"\n{EACH[i]}' for i in (1, 0)),
+        LISTED + "".join(f"[[drive]]\n{own}" for own in EACH),
+        LISTED + "".join(f"[drives.{name}]\n{own}" for name, own in zip(TWO, EACH, strict=True)),
     ],
 )
 def test_drives_are_read_in_each_way_of_writing_them_down(tmp_path, drives):
@@ -131,12 +138,37 @@ def test_drives_are_read_in_each_way_of_writing_them_down(tmp_path, drives):
         (f"[[drive]]\n{EACH[0]}", "no such key"),
         (f"[[drive]]\njoint = 3\n{EACH[0]}", "3"),
         ("joint = 3", "3"),
+        (f'{LISTED}[[drive]]\njoint = "shoulder"\n{EACH[0]}', "drives of ['shoulder']"),
+        (LISTED + f'[[drive]]\njoint = "elbow"\n{EACH[0]}' * 2, "drives of ['elbow', 'elbow']"),
+        (f"{LISTED}[[drive]]\n{EACH[0]}[[joint]]\n{EACH[1]}", "[[joint]] beside it"),
+        (f'[[joint]]\nname = "shoulder"\n{EACH[0]}[[joint]]\nname = "elbow"\ndamping = 3.0', "no such key"),
     ],
 )
 def test_drives_written_otherwise_are_one_clear_error(tmp_path, drives, found):
     with pytest.raises(DataError) as caught:
         load_robot(planar(tmp_path, drives))
     assert found in str(caught.value) and "robot.toml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_drives_of_which_nothing_is_said_are_guessed_from_the_bodies(tmp_path):
+    """As ``simgap robot`` would, of those joints alone, and beside what is said."""
+    folder = planar(tmp_path, f"{LISTED}[[drive]]\ngear_ratio = 80.0\ntorque_limit = 25.0\n[[drive]]\n{EACH[1]}")
+    robot, (guess, _) = load_robot(folder), (g.joint for g in draft_robot(folder / "arm.urdf").guesses)
+    assert robot.guessed["stiffness"] == ("shoulder",) and robot.guessed["gear_ratio"] == ()
+    assert robot.joints[0] == replace(guess, gear_ratio=80.0, torque_limit=25.0)
+    assert robot.joints[1].stiffness == FIGURES["stiffness"][1]
+    (folder / "robot.toml").write_text(f'urdf = "arm.urdf"\n{LISTED}')
+    assert [j.stiffness for j in load_robot(folder).joints] == [
+        g.joint.stiffness for g in draft_robot(folder / "arm.urdf").guesses
+    ]
+
+
+@pytest.mark.parametrize(("efforts", "believed"), [((1e4, 1e4), False), ((1e4, 2e3), True), ((4.0, 4.0), True)])
+def test_one_limit_of_all_torques_that_is_far_too_high_is_a_placeholder(tmp_path, efforts, believed):
+    folder = planar(tmp_path, LISTED, efforts)
+    torques = load_robot(folder).array("torque_limit")
+    assert np.array_equal(torques, efforts) == believed
+    assert believed or np.all(torques < 100.0)
 
 
 def test_an_unknown_robot_lists_the_known_ones():

@@ -27,7 +27,7 @@ from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
 from ident.segment_file import LARGEST, SHORTEST
 from robot_assets.errors import DataError
-from robot_assets.robot import Robot, guessed_joints, linear_joints, load_robot
+from robot_assets.robot import Robot, linear_joints, load_robot
 
 
 def convert_logs(
@@ -125,13 +125,12 @@ def _check_roles(logs: list[tuple[str, dict[str, Path]]], m: LogMap, where: str)
 
 def _tell_guessed_ratios(m: LogMap, arm: Robot, say: Callable[[str], None]) -> None:
     """Say where figures of a drive that are guesses scale what is converted."""
-    guessed = guessed_joints(arm, "gear_ratio")
-    scaled = [c for c in m.columns if c.geared and arm.joint_names[c.joint] in guessed]
+    scaled = [c for c in m.columns if c.geared and arm.joint_names[c.joint] in arm.guessed["gear_ratio"]]
     if scaled:
         channels = ", ".join(dict.fromkeys(c.channel for c in scaled))
         joints = ", ".join(name for j, name in enumerate(arm.joint_names) if j in {c.joint for c in scaled})
         say(
-            f"{channels} of {joints} scaled by a gear_ratio that is marked GUESS in robot.toml: take the mark away where it is known"
+            f"{channels} of {joints} scaled by a gear_ratio that is a guess, not given or marked GUESS in robot.toml: give it, and take the mark away, where it is known"
         )
 
 
