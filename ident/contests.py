@@ -105,7 +105,8 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     ran = [Candidate(e.hypothesis, r, 0.0) for e, r in zip(entrants, fits, strict=True) if r is not None]
     if len(ran) < 2 or ran[0].hypothesis is not own.hypothesis:
         return current, found
-    ran = workers.map(finished, in_reach(ran))
+    near = in_reach(ran)
+    ran = [new or c for c, new in zip(near, workers.map_in_time(finished, near), strict=True)]
     first = ran[0].fit
     kept = best_of_each(ran)
     names = {c.hypothesis.key for c in kept}

@@ -221,7 +221,7 @@ def beside_unclear(
     """
     direct, scores = explore(problem, current, hypotheses, 0.0, bare, workers)
     hopefuls = best_named([(h, r) for h, r in direct if not last_is_pointless(r)], FINALISTS, FINALISTS)
-    same = workers.map(lambda x: refit(problem, x[1].model, found.before.weights, x[1].remainders), hopefuls)
+    same = workers.map_in_time(lambda x: refit(problem, x[1].model, found.before.weights, x[1].remainders), hopefuls)
     known = [(c.hypothesis, c.fit) for c in found.candidates]
     new = [
         (h, r) for (h, _), r in zip(hopefuls, same, strict=True) if r is not None and all(h is not k for k, _ in known)

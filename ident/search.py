@@ -169,7 +169,7 @@ def under_noise_of_best(
     last = min(max(near, FINALISTS), HOPEFUL)
     if before.chi2_per_dof > FAINT and top.cost - top.count > (1.0 - WORTH_A_REFIT) * (before.cost - before.count):
         last = 0  # far from an answer in any noise
-    fits = workers.map(moved, ranked[:last])
+    fits = workers.map_in_time(moved, ranked[:last])
     again = [*fits, *[None] * len(ranked[last:])]
     weighed = [
         (h, r if is_along_record(h) else new or reweighted(problem, r, weights))
@@ -251,8 +251,8 @@ def explore(
     hardly = left_by(found) > (1.0 - HARDLY) * excess
     if not hardly and not (rough and left_by(found) < ANSWERED * excess):
         enough = to_compete(min(r.cost for _, r in found), stage.count)
-        last = workers.map(finished, [r for _, r in found])
-        found = [(h, r) for (h, _), r in zip(found, last, strict=True)]
+        last = workers.map_in_time(finished, [r for _, r in found])
+        found = [(h, new or r) for (h, r), new in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores
 
 
