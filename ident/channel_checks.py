@@ -54,6 +54,7 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
     kinds, linear = read_urdf(robot.urdf).kinds, linear_joints(robot)
     v = velocity(s, dataset.sample_rate)
     limits, speeds = robot.array("torque_limit"), robot.array("velocity_limit")
+    alike = robot.n > 1 and np.ptp(limits) == 0.0  # one limit of all joints was put in for none
     for j, name in enumerate(dataset.joints):
         m, newton = ("m", "N") if linear[j] else ("rad", "N m")
         q, tau = s.q[:, j], s.tau[:, j]
@@ -75,11 +76,12 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
                 f"q_{j + 1} ({name}) moves at {fast:.4g} {m}/s, its limit is {speeds[j]:.4g}: wrong unit or sample rate?"
             )
         top = float(np.abs(tau).max())
-        if top > 3 * limits[j]:
+        known = name not in robot.guessed["torque_limit"]
+        if known and top > 3 * limits[j]:
             out.append(
                 f"tau_{j + 1} ({name}) reaches {top:.4g} {newton}, its limit is {limits[j]:.4g}: wrong unit or side of the gear?"
             )
-        elif 0 < top < 2e-3 * limits[j]:
+        elif known and 0 < top < 2e-3 * limits[j] and not alike:
             out.append(
                 f"tau_{j + 1} ({name}) stays below {top:.3g} {newton}, its limit is {limits[j]:.4g}: current, or torque before the gear?"
             )

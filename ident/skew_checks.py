@@ -29,7 +29,8 @@ LONGEST = 2000  # instants that an estimate of skew looks at
 RANK = 1e-6  # of the largest singular value, below which columns tell the same
 EXPLAINED = 0.9  # share of the torque that must be explained for its skew to mean anything
 GONE = 0.3  # share of what is unexplained without a skew that must go with it,
-NOTHING = 1.5  # unless no more is left than so many times what the noise of the torque leaves in the band
+# unless what the noise of the torque leaves in the band is left, within this factor: far less says that this is no noise
+NOTHING = 1.5
 SURE = 8.0  # deviations of a skew, of eight stretches of time: one in ten thousand by chance (Student's t)
 ONE_JOINT = 0.5  # share of a skew that may go with one joint
 MOVING = 0.1  # of the largest speed: slower samples are left out, where friction is of another kind
@@ -137,7 +138,8 @@ def _fit(s: Segment, dataset: Dataset, start: float, margin: float = SETTLED, le
         return None
     skew = Skew(float(late), _spread(A[rows], slope, y.ravel()[rows], block))
     noise = float(np.sum(sums.keep * (difference_noise(s.tau) / sums.scale) ** 2)) * _passed(rate)
-    if start == 0.0 and skew.sure and unexplained[-1] > max((1.0 - GONE) * unexplained[0], NOTHING * noise):
+    as_noise = noise / NOTHING <= unexplained[-1] <= NOTHING * noise
+    if start == 0.0 and skew.sure and unexplained[-1] > (1.0 - GONE) * unexplained[0] and not as_noise:
         return UNKNOWN
     at = np.tile(np.arange(n), len(pick))[rows]
     for j in range(n) if skew.sure and n > 1 else ():

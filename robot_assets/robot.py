@@ -71,8 +71,8 @@ class Robot:
 
     Attributes:
         locked: URDF joints that do not move, with their position, rad or m.
-        guessed: figure of a drive -> joints of which it is a guess: ``robot.toml`` does not give it, or still marks it
-            GUESS in the comment beside it, as ``simgap robot`` writes it.
+        guessed: figure of a drive, or "torque_limit" -> joints of which it is a guess: ``robot.toml`` does not give it,
+            nor the URDF the limit, or still marks it GUESS in the comment beside it, as ``simgap robot`` writes it.
     """
 
     name: str
@@ -156,7 +156,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
         q_min=np.array([tree.limits[n][0] for n in names]),
         q_max=np.array([tree.limits[n][1] for n in names]),
         description=str(data.get("description", "")),
-        guessed=_guessed(path, names, entries),
+        guessed=_guessed(path, entries, joints, tree),
     )
 
 
@@ -228,21 +228,25 @@ def _given(entry: dict, figure: str) -> list[str]:
     return [name for name in (figure, *OTHER_NAMES.get(figure, ())) if name in entry]
 
 
-def _guessed(path: Path, names: list[str], entries: list[dict]) -> dict[str, tuple[str, ...]]:
+def _guessed(
+    path: Path, entries: list[dict], joints: tuple[Joint, ...], tree: Description
+) -> dict[str, tuple[str, ...]]:
     drives = DRIVE.split(path.read_text(encoding="utf-8-sig"))[1:]
-    drives += [""] * (len(names) - len(drives))
+    drives += [""] * (len(joints) - len(drives))
 
     def marked(figure: str) -> re.Pattern[str]:
         aliases = "|".join((figure, *OTHER_NAMES.get(figure, ())))
         return re.compile(rf"(?m)^[ \t]*({aliases})[ \t]*=[^#\n]*#.*\bGUESS\b")
 
+    def unknown(figure: str, joint: Joint, entry: dict, drive: str) -> bool:
+        if figure == "torque_limit" and not _given(entry, figure):
+            return joint.torque_limit != tree.efforts[joint.name]
+        return not _given(entry, figure) or bool(marked(figure).search(drive))
+
+    each = list(zip(joints, entries, drives, strict=False))
     return {
-        figure: tuple(
-            name
-            for name, entry, drive in zip(names, entries, drives, strict=False)
-            if not _given(entry, figure) or marked(figure).search(drive)
-        )
-        for figure in OF_DRIVE
+        figure: tuple(joint.name for joint, entry, drive in each if unknown(figure, joint, entry, drive))
+        for figure in (*OF_DRIVE, "torque_limit")
     }
 
 

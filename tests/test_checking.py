@@ -472,3 +472,24 @@ def test_drives_that_are_guesses_are_told(arm, log):
     guessed = replace(arm, guessed=arm.guessed | {"stiffness": ("elbow_joint",)})
     assert told in inspect_dataset(dataset(guessed, log)).text()
     assert "not known" not in inspect_dataset(dataset(arm, log)).text()
+
+
+@pytest.mark.parametrize(("limit", "guessed", "told"), [
+    ([5e4] * 5 + [4e4], (), True),
+    ([5e4] * 6, (), False),  # put in for none
+    ([5e4] * 5 + [4e4], "all", False),  # of no one's
+])  # fmt: skip
+def test_a_torque_is_small_beside_limits_that_are_known(arm, log, limit, guessed, told):
+    joints = tuple(replace(joint, torque_limit=each) for joint, each in zip(arm.joints, limit, strict=True))
+    unknown = arm.joint_names if guessed else ()
+    placed = replace(arm, joints=joints, guessed=arm.guessed | {"torque_limit": unknown})
+    assert any("stays below" in line for line in warnings(placed, log)) == told
+
+
+def test_steps_of_a_position_are_no_skew(arm):
+    """The loop turns them into torques beyond the noise of these; what is left is far less than that noise says."""
+    s = recording(arm, np.random.default_rng(0))
+    coarse = s.q.copy()
+    coarse[:, 1] = np.round(coarse[:, 1] / 5e-4) * 5e-4
+    loud = replace(s, q=coarse, tau=s.tau + 1e5 * (coarse - s.q))
+    assert not np.isfinite(torque_skew(loud, dataset(arm, s)).late)
