@@ -39,9 +39,12 @@ from ident.motion import Solution, Torques
 from ident.recursion import chain_of, newton_euler
 from ident.time_steps import TimeSteps, differences
 
-REMAINDER_STEPS = 120  # fixed-point steps at most for the geometric remainder
+REMAINDER_STEPS = 250  # fixed-point steps at most for the geometric remainder
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
-STALL_STEPS = 12  # in which the change must halve: where no motion repeats the search for one does not end
+# in which the change must halve: where no motion repeats the search for one does not end. Large motions of links that
+# are hardly damped take a direction of the search for each resonant line, and more than forty steps for a half.
+STALL_STEPS = 45
+ROOM = 1 << 29  # bytes for past steps
 NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
 LEAST_KEPT = 0.1  # of the torque, that its record keeps of any line
 ROUNDING = 1e-12  # of the recorded torque, below which a remainder is none
@@ -244,7 +247,7 @@ def solve(
         if not np.all(np.isfinite(change)):
             raise FloatingPointError("the motion of the links cannot be solved")
         # Where links hang on lightly damped gears the plain step leads away along many directions: all are remembered.
-        past = [*past, (W[left], change[left])]
+        past = [*past, (W[left], change[left])][-max(STALL_STEPS, ROOM // (4 * W[left].nbytes)) :]
         W = W.copy()
         W[left] = mixed(past)
         if react is not None:

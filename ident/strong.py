@@ -3,7 +3,7 @@ that are predicted whole."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -42,6 +42,7 @@ OTHER_MOTION = 10.0
 CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
 FAR_BEHIND = 1.5  # cost at its joint of a law along the record over that of the best candidate, beyond which it is out
 HARDLY_LESS = 0.9  # of what is left without a strong effect under softened weights, for that to explain anything
+UNANSWERED = 0.1  # share of the discrepancy that the best may leave before laws of the gear are sought at all joints
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 
 
@@ -60,7 +61,8 @@ def beside_strong(
     Strong effects are therefore fitted from the starting guesses of the drives, under their own noise; laws of the
     gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
     as loops where these do as well. Those at the joint of the best candidate come first, and last where its own law
-    leaves noise alone.
+    leaves noise alone. A gear that bends turns the links of others too, and their drives with them to where any joint
+    may be the loudest: where these cannot be those of the arm, and nothing answers, laws of the gear are sought at all.
 
     Args:
         quiet: joints at which none is sought.
@@ -84,19 +86,23 @@ def beside_strong(
 
     top = min(ranked, key=lambda x: x[1].cost, default=None)
     likely, key = (top[0].joint, top[0].key) if top else (-1, None)
-    chosen = strong_effects(problem, before, scores, likely, quiet)
+    loudest = loudest_joint(before, quiet)
+    chosen = strong_effects(problem, before, scores, {loudest, likely} - quiet - {-1})
     few = thinned(problem)
     without = without_strong(few, before if few is problem else replace(before, softer=())) if chosen else ()
-    chosen = [
-        replace(s, hypothesis=along_record(s.hypothesis)) if s.hypothesis.channel == "spring" else s for s in chosen
-    ]
-    pairs: list[tuple[Hypothesis, Fit]] = []
-    for here in (True, False):
-        some = [s for s in chosen if (s.hypothesis.joint == likely) == here]
+
+    def tried(some: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
+        some = [replace(s, hypothesis=along_record(s.hypothesis)) if is_spring(s) else s for s in some]
         fits = workers.map_in_time(found, some, lambda s: f"strong: {s.hypothesis.effect} at {s.hypothesis.place}")
-        pairs += [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not last_is_pointless(r)]
-        if any(h.key == key and settled(r) for h, r in pairs):
-            break
+        return [(s.hypothesis, r) for s, r in zip(some, fits, strict=True) if r and not last_is_pointless(r)]
+
+    pairs = tried([s for s in chosen if s.hypothesis.joint == likely])
+    if not any(h.key == key and settled(r) for h, r in pairs):
+        pairs += tried([s for s in chosen if s.hypothesis.joint != likely])
+    unanswered = left_by([*ranked, *pairs]) > UNANSWERED * (before.cost - before.count)
+    if chosen and unanswered and implausible(problem, before) and not workers.late:
+        elsewhere = set(range(problem.structure.n)) - quiet - {loudest, likely}
+        pairs += tried([s for s in strong_effects(problem, before, scores, elsewhere) if is_spring(s)])
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     # Noise along the record is taken large: a law that leaves as much even in that as no law, or clearly more than the
     # best, is far off.
@@ -189,29 +195,34 @@ def recovered(problem: Problem, result: Fit) -> Fit:
     return result
 
 
-def strong_effects(
-    problem: Problem, stage: Fit, scores: Sequence[Score], likely: int, quiet: frozenset[int] = frozenset()
-) -> list[Score]:
-    """Friction and the laws of the gear, of a strong size, at a ``likely`` joint and where most of the discrepancy is.
+def is_spring(score: Score) -> bool:
+    """Whether a hypothesis is a law of the gear."""
+    return score.hypothesis.channel == "spring"
 
-    None at joints that are ``quiet``: where most of it is at one of these, the next joint takes its place if it has
-    ``SPILT`` of that.
+
+def loudest_joint(stage: Fit, quiet: frozenset[int]) -> int:
+    """Where most of the discrepancy is; -1 where nowhere. Where that is at a joint that is ``quiet``, the next joint takes
+    its place if it has ``SPILT`` of that."""
+    excess = stage.costs - stage.counts
+    loud = set(np.flatnonzero(excess >= SPILT * excess.max()).tolist()) - quiet
+    return max(loud, key=lambda j: float(stage.costs[j]), default=-1)
+
+
+def strong_effects(problem: Problem, stage: Fit, scores: Sequence[Score], joints: Collection[int]) -> list[Score]:
+    """Friction and the laws of the gear, of a strong size, at some joints.
 
     A gear that stiffens or softens moves its resonance with the amplitude, and a joint that sticks most
     of the time hardly shows its inertia: the linear step of a score says little about either. Motions below the
     resonances hardly show the gears.
     """
     preds = predictions(problem, stage.model, stage.remainders)
-    excess = stage.costs - stage.counts
-    loud = set(np.flatnonzero(excess >= SPILT * excess.max()).tolist()) - quiet
-    loudest = max(loud, key=lambda j: stage.costs[j], default=-1)
-    scales = {j: signal_scale(problem, preds, j, ()) for j in {loudest, likely} - quiet if j >= 0}
+    scales = {j: signal_scale(problem, preds, j, ()) for j in joints}
     return [
         replace(s, start=s.hypothesis.options["size"](scales[s.hypothesis.joint]))
         for s in scores
         if s.hypothesis.joint in scales
         and "size" in s.hypothesis.options
-        and not (problem.motions_alone and s.hypothesis.channel == "spring")
+        and not (problem.motions_alone and is_spring(s))
     ]
 
 

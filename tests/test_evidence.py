@@ -51,7 +51,7 @@ from ident.reporting import frf_views, most_affected
 from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
 from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
 from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, choose, explore, other_bodies
-from ident.strong import OTHER_MOTION, beside_strong, matched, outdone_along, strong_effects
+from ident.strong import OTHER_MOTION, beside_strong, loudest_joint, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
 from ident.trust import fails_held_out, left_on_held_out, patchwork, shadowed, shown
 from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, JointGain, Value
@@ -1004,12 +1004,10 @@ def test_strong_effects_are_sought_at_the_loudest_joint_that_is_not_quiet(identi
     )
     stage = replace(result, costs=result.counts * np.array([1.0, 3.0, 9.0, 1.0, 1.0, 1.0]))
 
-    def joints(likely: int, quiet: set[int]) -> set[int]:
-        return {s.hypothesis.joint for s in strong_effects(problem, stage, scores, likely, frozenset(quiet))}
-
-    assert joints(4, set()) == {2, 4} and joints(4, {2}) == {1, 4} and joints(2, {2}) == {1}
-    assert joints(4, {1, 2}) == {4}  # what the others have is what the errors at the quiet joint leave there
-    assert joints(4, set(range(6))) == set()
+    assert loudest_joint(stage, frozenset()) == 2 and loudest_joint(stage, frozenset({2})) == 1
+    # What the others have is what the errors at the quiet joint leave there.
+    assert loudest_joint(stage, frozenset({1, 2})) == loudest_joint(stage, frozenset(range(6))) == -1
+    assert {s.hypothesis.joint for s in strong_effects(problem, stage, scores, {2, 4})} == {2, 4}
 
 
 @pytest.mark.parametrize(("left", "loudly"), [(0.5 * LAWS_LEAVE, False), (2.0 * LAWS_LEAVE, True)])
@@ -1517,6 +1515,42 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
     loud = replace(baseline, costs=10.0 * baseline.counts)
     beside_strong(setup.problem, loud, [(backlash, replace(loud, costs=5.0 * baseline.counts))], [], Workers())
     assert tried == joints
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("bent", "left", "joints"), [
+    (True, 5.0, {0, 1, 2, 3, 4, 5}),
+    (False, 5.0, {2, 4}),  # drives that can be those of the arm
+    (True, 2.0, {2, 4}),  # an answer
+])  # fmt: skip
+def test_laws_of_the_gear_are_sought_everywhere_where_drives_are_bent_and_nothing_answers(
+    identified, monkeypatch, bent, left, joints
+):
+    """There any joint may be the loudest. Friction is that of its own joint."""
+    _, setup, baseline = identified
+    asked = ("backlash", "coulomb_friction")
+    laws = {h.key: h for h in catalogue(setup.problem.structure) if h.effect in asked}
+    tried = []
+
+    def annealed(problem, start, **options):
+        tried.append(start.effects[-1].hypothesis)
+        return replace(baseline, model=start, costs=left * baseline.counts)
+
+    scores = [Score(h, 1.0, 1, np.array([1e-4, 0.0]), np.ones(1), ()) for h in laws.values()]
+    monkeypatch.setattr("ident.strong.anneal", annealed)
+    for name in ("without_strong", "simulated", "under_own_noise"):
+        monkeypatch.setattr(f"ident.strong.{name}", lambda *args: args[1:] if len(args) == 3 else ())
+    monkeypatch.setattr("ident.strong.recovered", lambda problem, result: result)
+    monkeypatch.setattr("ident.strong.either_turn", lambda problem, result, effect: result)
+    monkeypatch.setattr("ident.strong.under_its_noise", lambda problem, result: result)
+    monkeypatch.setattr("ident.strong.matched", lambda *args: False)
+    monkeypatch.setattr("ident.strong.implausible", lambda problem, result, at=None: bent and at is None)
+    monkeypatch.setattr("ident.strong.under_noise_of_best", lambda problem, before, ranked, workers: (before, ranked))
+    loud = replace(baseline, costs=baseline.counts * np.array([10.0, 10.0, 10.0, 10.0, 30.0, 10.0]))
+    best = laws["backlash", "elbow_joint"], replace(loud, costs=5.0 * baseline.counts)
+    beside_strong(setup.problem, loud, [best], scores, Workers())
+    assert {h.joint for h in tried if h.effect == "backlash"} == joints
+    assert {h.joint for h in tried if h.effect == "coulomb_friction"} == {2, 4}
 
 
 def test_the_cause_between_two_joints_names_both(identified, named):
