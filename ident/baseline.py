@@ -10,6 +10,7 @@ import numpy as np
 import scipy.stats
 
 from ident.graybox import Parameters
+from ident.log_spectra import begun_by_logarithms
 from ident.model import Effect, Model
 from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
@@ -39,7 +40,7 @@ def fit_baseline(
     """Baseline parameters of the gray-box, with the ``effects`` that every candidate has too.
 
     Where the fit leaves more than the noise it is started again: with less error added from the first, which leads into
-    other minima; with other dampers, which are determined far worse than springs, and do not come back once they have
+    other minima; from drives that the logarithms of the spectra tell; with other dampers, which are determined far worse than springs, and do not come back once they have
     collapsed; and gears that have gone astray, as one that is overdamped and hides its spring, from their guesses.
     """
     start = Model(problem.structure, problem.nominal, effects)
@@ -57,8 +58,10 @@ def fit_baseline(
         )
 
     if best.chi2_per_dof > DETECTION_EXCESS:
-        other = anneal(problem, start, ladder=ANNEALING[1:], progress=progress)
-        best = min(best, other, key=lambda f: (np.sum(astray(problem, f)), f.cost))
+        others = [anneal(problem, start, ladder=ANNEALING[1:], progress=progress)]
+        if (par := begun_by_logarithms(problem)) is not problem.nominal:
+            others.append(anneal(problem, replace(start, par=par), progress=progress))
+        best = min(best, *others, key=lambda f: (np.sum(astray(problem, f)), f.cost))
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
@@ -88,15 +91,22 @@ def renewed(problem: Problem, result: Fit, progress: Callable[[str], None] | Non
 
 
 def begun_again(problem: Problem, par: Parameters, lost: np.ndarray) -> Parameters:
-    """Parameters with the drives of some joints (n,) back at their starting guesses."""
-    return replace(par, **{name: np.where(lost, getattr(problem.nominal, name), getattr(par, name)) for name in DRIVE})
+    """Parameters with the drives of some joints (n,) back at where they began."""
+    return replace(par, **{name: np.where(lost, getattr(problem.begun, name), getattr(par, name)) for name in DRIVE})
 
 
 def astray(problem: Problem, result: Fit) -> np.ndarray:
     """(n,) whether a gear has ended far from its starting guess."""
     par, guess = result.model.par, problem.nominal
     far = [np.abs(np.log(a / b)) for a, b in ((par.stiffness, guess.stiffness), (par.damping, guess.damping))]
-    return (far[0] > np.log(IMPLAUSIBLE)) | (far[1] > np.log(ASTRAY))
+    return (far[0] > credible(problem)) | (far[1] > np.log(ASTRAY) + credible(problem) - np.log(IMPLAUSIBLE))
+
+
+def credible(problem: Problem) -> np.ndarray:
+    """(n,) natural logarithm of the factor between a drive figure and its starting guess, up to which it may be that of
+    the arm."""
+    robot = problem.structure.robot
+    return np.log(np.where(np.isin(robot.joint_names, guessed_drives(robot)), GUESSED, IMPLAUSIBLE))
 
 
 def discrepancy_p_value(result: Fit) -> float:
@@ -139,9 +149,7 @@ def implausible(problem: Problem, result: Fit, joints: Sequence[int] | None = No
     n, x = problem.structure.n, result.model.par.to_log() - problem.nominal.to_log()
     drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
     known = np.sqrt(np.maximum(np.diag(result.covariance())[drives], 0.0)) < UNDETERMINED
-    robot = problem.structure.robot
-    guessed = np.isin(robot.joint_names, guessed_drives(robot))
-    limit = np.log(np.where(np.tile(guessed, 2), GUESSED, IMPLAUSIBLE))
+    limit = np.tile(credible(problem), 2)
     # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
     # its link: there the gears take up what else is wrong, and only a motor that is known tells.
     low = x[drives] < -limit

@@ -30,6 +30,8 @@ class Problem:
         nominal: starting guesses, centre of the weak prior.
         tau_std, q_std: (n,) sample noise where single periods give no scatter.
         free_timing: whether a common timing offset is fitted.
+        start: drives to begin with where a fit of the drives alone leads to some that cannot be those of the arm; else
+            None.
         scatter_share: of what the scatter between periods says that noise adds to costs, that is taken off where these
             are compared; that which the baseline has borne, none before it is known.
     """
@@ -42,6 +44,12 @@ class Problem:
     q_std: np.ndarray
     free_timing: bool = True
     scatter_share: float = 0.0
+    start: Parameters | None = None
+
+    @property
+    def begun(self) -> Parameters:
+        """Drives from which strong effects are sought."""
+        return self.nominal if self.start is None else self.start
 
     @property
     def motions_alone(self) -> bool:

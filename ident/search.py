@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS
+from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS, implausible
 from ident.coordinates import stepped
 from ident.costs import weighted_cost
 from ident.evidence import explained, last_is_pointless
@@ -73,7 +73,12 @@ def soften(problem: Problem, current: Fit) -> tuple[Fit, float]:
 
 
 def softened(problem: Problem, current: Fit) -> tuple[Fit, ...]:
-    """The model fitted from the starting guesses of the drives under each of the softened weights of ``ANNEALING``."""
+    """The model fitted from the starting guesses of the drives under each of the softened weights of ``ANNEALING``; as it
+    is with the drives that a problem begins with, where its own cannot be those of the arm: to these they would lead
+    again."""
+    if problem.start is not None and implausible(problem, current):
+        begun = replace(current, model=replace(current.model, par=problem.start))
+        return tuple(on_few(problem, begun, rho) for rho in ANNEALING[:-1])
     if current.softer:
         return current.softer
     last = anneal(problem, replace(current.model, par=problem.nominal), ladder=ANNEALING[:-1])

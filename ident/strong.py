@@ -71,7 +71,7 @@ def beside_strong(
     annealed = partial(anneal, iterations=STRONG_STEPS, gap=STRONG_GAP, progress=workers.until_late)
 
     def found(score: Score) -> Fit | None:
-        start = Model(problem.structure, problem.nominal, extended_by(before.model.effects, score))
+        start = Model(problem.structure, problem.begun, extended_by(before.model.effects, score))
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # on the way to a model that cannot be computed
                 first = annealed(few, start, ladder=SOFTLY)
