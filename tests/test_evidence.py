@@ -1249,6 +1249,14 @@ def test_a_body_is_another_only_where_its_figures_together_say_so(named, off, tr
     assert shown(Effect(body, p), final, covariance) == trusted
 
 
+@pytest.mark.parametrize(("scale", "trusted"), [(1.0 + 1e-4, False), (1.0 + 1e-3, True)])
+def test_a_torque_constant_is_another_only_beyond_chance(named, scale, trusted):
+    """One that stood for a cause which was found after it is as described in the end, and as sure."""
+    constant = named["torque_constant", "elbow_joint"]
+    final = SimpleNamespace(names=[constant.coordinate("scale")])
+    assert shown(Effect(constant, np.array([scale])), final, np.array([[1e-8]])) == trusted
+
+
 def test_what_is_no_chance_and_yet_no_discrepancy_is_said():
     """A tiny p-value beside ``detected: false`` is explained; none is needed where the model leaves noise, or causes
     were sought."""

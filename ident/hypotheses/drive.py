@@ -13,7 +13,7 @@ from ident.inverse import recorded_share
 from ident.motion import Motion, Recorded
 
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
-SCALE = Parameter("scale", "1", 0.2, 5.0, log=True)  # delivered torque over the recorded one
+SCALE = Parameter("scale", "1", 0.2, 5.0, log=True, null=1.0)  # delivered torque over the recorded one
 MOST_RIPPLE = 0.5  # of the torque of a motor, that ripples with it
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
