@@ -40,11 +40,20 @@ def fit_baseline(
     """Baseline parameters of the gray-box, with the ``effects`` that every candidate has too.
 
     Where the fit leaves more than the noise it is started again: with less error added from the first, which leads into
-    other minima; from drives that the logarithms of the spectra tell; with other dampers, which are determined far worse than springs, and do not come back once they have
+    other minima; from drives that the logarithms of the spectra tell, which come first where the nominal ones are
+    guesses; with other dampers, which are determined far worse than springs, and do not come back once they have
     collapsed; and gears that have gone astray, as one that is overdamped and hides its spring, from their guesses.
     """
-    start = Model(problem.structure, problem.nominal, effects)
-    best = first = anneal(problem, start, progress=progress)
+    guessed = bool(guessed_drives(problem.structure.robot))
+
+    def begun(by_logarithms: bool, ladder: Sequence[float] = ANNEALING) -> Fit:
+        """Fitted from the nominal drives, or from those of ``begun_by_logarithms`` and near these at first."""
+        from_there = replace(problem, nominal=begun_by_logarithms(problem)) if by_logarithms else problem
+        model = Model(problem.structure, from_there.nominal, effects)
+        return anneal(from_there, model, ladder=ladder, progress=progress)
+
+    best = first = begun(guessed)
+    softer = first.softer
 
     def again(par: Parameters) -> Fit:
         """Fitted from other drives."""
@@ -58,10 +67,9 @@ def fit_baseline(
         )
 
     if best.chi2_per_dof > DETECTION_EXCESS:
-        others = [anneal(problem, start, ladder=ANNEALING[1:], progress=progress)]
-        if (par := begun_by_logarithms(problem)) is not problem.nominal:
-            others.append(anneal(problem, replace(start, par=par), progress=progress))
-        best = min(best, *others, key=lambda f: (np.sum(astray(problem, f)), f.cost))
+        rest = first if problem.motions_alone else begun(not guessed)
+        best = min(first, begun(guessed, ANNEALING[1:]), rest, key=lambda f: (np.sum(astray(problem, f)), f.cost))
+        softer = rest.softer if best is rest else first.softer
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
             par = best.model.par
@@ -73,7 +81,7 @@ def fit_baseline(
         # Where they only go astray elsewhere they stand for what is missing.
         if other.cost < best.cost and np.sum(astray(problem, other)) < np.sum(lost):
             best = other
-    return replace(renewed(problem, best, progress), softer=first.softer)
+    return replace(renewed(problem, best, progress), softer=softer)
 
 
 def renewed(problem: Problem, result: Fit, progress: Callable[[str], None] | None = None) -> Fit:
