@@ -42,7 +42,7 @@ OTHER_MOTION = 10.0
 CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that of one predicted whole, for it to count
 FAR_BEHIND = 1.5  # cost at its joint of a law along the record over that of the best candidate, beyond which it is out
 HARDLY_LESS = 0.9  # of what is left without a strong effect under softened weights, for that to explain anything
-UNANSWERED = 0.1  # share of the discrepancy that the best may leave before laws of the gear are sought at all joints
+UNANSWERED = 30.0  # chi2 per degree of freedom that the best may leave before laws of the gear are sought at all joints
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 
 
@@ -99,7 +99,7 @@ def beside_strong(
     pairs = tried([s for s in chosen if s.hypothesis.joint == likely])
     if not any(h.key == key and settled(r) for h, r in pairs):
         pairs += tried([s for s in chosen if s.hypothesis.joint != likely])
-    unanswered = left_by([*ranked, *pairs]) > UNANSWERED * (before.cost - before.count)
+    unanswered = left_by([*ranked, *pairs]) > UNANSWERED * before.count
     if chosen and unanswered and implausible(problem, before) and not workers.late:
         elsewhere = set(range(problem.structure.n)) - quiet - {loudest, likely}
         pairs += tried([s for s in strong_effects(problem, before, scores, elsewhere) if is_spring(s)])

@@ -1527,8 +1527,8 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("bent", "left", "joints"), [
-    (True, 5.0, {0, 1, 2, 3, 4, 5}),
-    (False, 5.0, {2, 4}),  # drives that can be those of the arm
+    (True, 50.0, {0, 1, 2, 3, 4, 5}),
+    (False, 50.0, {2, 4}),  # drives that can be those of the arm
     (True, 2.0, {2, 4}),  # an answer
 ])  # fmt: skip
 def test_laws_of_the_gear_are_sought_everywhere_where_drives_are_bent_and_nothing_answers(
@@ -1554,8 +1554,8 @@ def test_laws_of_the_gear_are_sought_everywhere_where_drives_are_bent_and_nothin
     monkeypatch.setattr("ident.strong.matched", lambda *args: False)
     monkeypatch.setattr("ident.strong.implausible", lambda problem, result, at=None: bent and at is None)
     monkeypatch.setattr("ident.strong.under_noise_of_best", lambda problem, before, ranked, workers: (before, ranked))
-    loud = replace(baseline, costs=baseline.counts * np.array([10.0, 10.0, 10.0, 10.0, 30.0, 10.0]))
-    best = laws["backlash", "elbow_joint"], replace(loud, costs=5.0 * baseline.counts)
+    loud = replace(baseline, costs=baseline.counts * np.array([100.0, 100.0, 100.0, 100.0, 300.0, 100.0]))
+    best = laws["backlash", "elbow_joint"], replace(loud, costs=50.0 * baseline.counts)
     beside_strong(setup.problem, loud, [best], scores, Workers())
     assert {h.joint for h in tried if h.effect == "backlash"} == joints
     assert {h.joint for h in tried if h.effect == "coulomb_friction"} == {2, 4}
