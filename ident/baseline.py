@@ -10,7 +10,7 @@ import numpy as np
 import scipy.stats
 
 from ident.graybox import Parameters
-from ident.log_spectra import begun_by_logarithms
+from ident.log_spectra import begun_by_logarithms, looked_at, mean_cost, valley
 from ident.model import Effect, Model
 from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
@@ -103,6 +103,17 @@ def begun_again(problem: Problem, par: Parameters, lost: np.ndarray) -> Paramete
     return replace(par, **{name: np.where(lost, getattr(problem.begun, name), getattr(par, name)) for name in DRIVE})
 
 
+def start_of(problem: Problem, result: Fit) -> Parameters | None:
+    """Drives to begin with where those of a fit have been led away: the logarithms of the spectra agree better there;
+    else None."""
+    spectra = looked_at(problem) if result.chi2_per_dof > FAINT else []
+    if not spectra:
+        return None
+    model, cost = valley(problem, spectra, Model(problem.structure, problem.nominal))
+    there = replace(problem, start=model.par)
+    return model.par if bent(there, result) and cost < mean_cost(problem, spectra, result.model) else None
+
+
 def astray(problem: Problem, result: Fit) -> np.ndarray:
     """(n,) whether a gear has ended far from its starting guess."""
     par, guess = result.model.par, problem.nominal
@@ -154,10 +165,26 @@ def implausible(problem: Problem, result: Fit, joints: Sequence[int] | None = No
     Args:
         joints: whose drives are looked at; all where None.
     """
-    n, x = problem.structure.n, result.model.par.to_log() - problem.nominal.to_log()
+    return _far(problem, result, problem.nominal, credible(problem), joints)
+
+
+def bent(problem: Problem, result: Fit) -> bool:
+    """Whether drives of a fit have been led away, from what an arm like this may have or from what the problem begins
+    with."""
+    if problem.start is None:
+        return False
+    near = np.full(problem.structure.n, np.log(IMPLAUSIBLE))
+    return implausible(problem, result) or _far(problem, result, problem.start, near)
+
+
+def _far(
+    problem: Problem, result: Fit, centre: Parameters, limit: np.ndarray, joints: Sequence[int] | None = None
+) -> bool:
+    """Whether a stiffness or motor inertia is further than a limit (n,), natural logarithm of a factor, from others."""
+    n, x = problem.structure.n, result.model.par.to_log() - centre.to_log()
     drives = np.r_[:n, 2 * n : 3 * n]  # stiffness and motor inertia
     known = np.sqrt(np.maximum(np.diag(result.covariance())[drives], 0.0)) < UNDETERMINED
-    limit = np.tile(credible(problem), 2)
+    limit = np.tile(limit, 2)
     # A gear stiffer than the data can see ends anywhere above. Motions hardly show gears, nor a small motor beside
     # its link: there the gears take up what else is wrong, and only a motor that is known tells.
     low = x[drives] < -limit

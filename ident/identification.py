@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, FAINT, fit_baseline, implausible, renewed
+from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed, start_of
 from ident.chain import Structure, build_structure
 from ident.channel_checks import MOVES
 from ident.dataset import Dataset
@@ -15,7 +15,6 @@ from ident.extended import Prediction
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from ident.group import Group
 from ident.inverse import Sampling
-from ident.log_spectra import begun_by_logarithms
 from ident.noise import (
     DOUBT,
     alike_at_all_lines,
@@ -164,9 +163,8 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
         held_out = tuple(replace(g, U_noise=None, Q_noise=None) for g in held_out)
     # Where periods differ by a drift, as those of a motor that sticks do, what they differ by is no noise.
     share = 0.0 if np.any(drifting(setup.problem.groups)) else result.share
-    bent = result.chi2_per_dof > FAINT and not problem.motions_alone and implausible(problem, result)
-    start = begun_by_logarithms(problem) if bent else None
-    return replace(setup, problem=replace(problem, scatter_share=share, start=start), held_out=held_out), result
+    problem = replace(problem, scatter_share=share, start=start_of(problem, result))
+    return replace(setup, problem=problem, held_out=held_out), result
 
 
 def first_model(dataset: Dataset, setup: Setup, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:

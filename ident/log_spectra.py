@@ -9,15 +9,17 @@ has one broad valley, which a search along one drive figure after another finds.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ident.graybox import Parameters, equilibrium, impedance, linearise
 from ident.group import Group
 from ident.inverse import torque_record
-from ident.problem import Problem
+from ident.model import Effect, Model
+from ident.problem import NOT_COMPUTED, Problem
 from ident.thinning import thinned
 from robot_assets.robot import guessed_drives
 
@@ -51,35 +53,68 @@ def begun_by_logarithms(problem: Problem) -> Parameters:
     """Drives near the nominal ones, at which the logarithms of torques agree best with those of the records; the nominal
     ones where no record is periodic.
 
-    The arm is linear here, at its nominal equilibrium, and without effects.
+    The arm is linear here, and without effects.
     """
-    spectra = [x for g in thinned(problem).groups if g.window is None and np.any((x := spectra_of(g)).seen)]
-    if not spectra:
-        return problem.nominal
-    cost = _cost(problem, spectra)
+    spectra = looked_at(problem)
+    return valley(problem, spectra, Model(problem.structure, problem.nominal))[0].par if spectra else problem.nominal
+
+
+def valley(problem: Problem, spectra: Sequence[Spectra], model: Model) -> tuple[Model, float]:
+    """A model with drives near the nominal ones, and with a last effect that changes the chain near its own start, if it
+    has one, at which logarithms agree best; and what it costs, 0 to 1."""
+    n, nominal = problem.structure.n, problem.nominal
+    effect = model.effects[-1] if model.effects else None
+    drives = np.array([getattr(model.par, field) / getattr(nominal, field) for field in FIELDS])
     guessed = np.isin(problem.structure.robot.joint_names, guessed_drives(problem.structure.robot))
-    reach = np.log(np.where(guessed, GUESSED, KNOWN))
-    offsets = {field: np.zeros(problem.structure.n) for field in FIELDS}
-    best = cost(offsets)
+    reach = [*np.tile(np.log(np.where(guessed, GUESSED, KNOWN)), len(FIELDS))]
+    start, unit = [*np.log(drives).ravel()], [1.0] * (len(FIELDS) * n)
+    shows = [k < 2 * n for k in range(len(FIELDS) * n)]  # dampers show once resonances are in their places
+    for q in effect.hypothesis.parameters if effect else ():
+        start.append(0.0)
+        unit.append(1.0 if q.log else q.spread / np.log(STEPS[0]) / 2.0)
+        reach.append(np.log(GUESSED) if q.log else 2.0 * q.spread)
+        shows.append(not q.nuisance)
+    made = partial(_made, model, nominal)
+    cost = partial(mean_cost, problem, spectra)
+    x, best = np.array(start), cost(made(np.array(start)))
     for step in np.log(STEPS):
         whole = step == np.log(STEPS[0])
         for _ in range(SWEEPS):
             before = best
-            # Dampers show once resonances are in their places.
-            for field in FIELDS[:2] if whole else FIELDS:
-                for j in range(problem.structure.n):
-                    near = step * np.arange(-NEAR, NEAR + 1) + offsets[field][j]
-                    each = np.arange(-(reach[j] // step), reach[j] // step + 1) * step if whole else near
-                    others = [
-                        {**offsets, field: np.where(np.arange(len(reach)) == j, x, offsets[field])}
-                        for x in each[np.abs(each) <= reach[j]]
-                    ]
-                    costs = [cost(x) for x in others]
-                    if min(costs) < best:
-                        best, offsets = min(costs), others[int(np.argmin(costs))]
+            for k in range(len(x))[::-1]:
+                if whole and not shows[k]:
+                    continue
+                most = NEAR if not whole else int(2.0 * reach[k] / (step * unit[k]))
+                each = x[k] + step * unit[k] * np.arange(-most, most + 1)
+                others = [np.where(np.arange(len(x)) == k, v, x) for v in each[np.abs(each) <= reach[k]]]
+                costs = [cost(made(other)) for other in others]
+                if costs and min(costs) < best:
+                    best, x = min(costs), others[int(np.argmin(costs))]
             if best > (1.0 - BETTER) * before:
                 break
-    return _moved(problem.nominal, offsets)
+    return made(x), best
+
+
+def _made(model: Model, nominal: Parameters, x: np.ndarray) -> Model:
+    """A model at offsets: logarithms of drives over the nominal ones, and of the last effect those of its parameters."""
+    n = len(nominal.stiffness)
+    par = replace(
+        model.par, **{field: getattr(nominal, field) * np.exp(x[i * n : (i + 1) * n]) for i, field in enumerate(FIELDS)}
+    )
+    if not model.effects:
+        return replace(model, par=par)
+    *others, effect = model.effects
+    h = effect.hypothesis
+    moved = [
+        np.clip(v * np.exp(o) if q.log else v + o, q.lower, q.upper)
+        for q, v, o in zip(h.parameters, effect.p, x[len(FIELDS) * n :], strict=True)
+    ]
+    return replace(model, par=par, effects=(*others, Effect(h, np.array(moved))))
+
+
+def looked_at(problem: Problem) -> list[Spectra]:
+    """Lines of periodic groups, of some records, where these tell any."""
+    return [x for g in thinned(problem).groups if g.window is None and np.any((x := spectra_of(g)).seen)]
 
 
 def spectra_of(group: Group) -> Spectra:
@@ -94,24 +129,19 @@ def spectra_of(group: Group) -> Spectra:
     return Spectra(replace(group, omega=group.omega[lines]), group.Q[:, lines], torque, seen)
 
 
-def _moved(par: Parameters, offsets: dict[str, np.ndarray]) -> Parameters:
-    return replace(par, **{field: getattr(par, field) * np.exp(x) for field, x in offsets.items()})
-
-
-def _cost(problem: Problem, spectra: list[Spectra]) -> Callable[[dict[str, np.ndarray]], float]:
-    """What drives cost that differ from the nominal ones by the exponentials of offsets."""
-    structure, nominal = problem.structure, problem.nominal
-    there = [linearise(structure, equilibrium(structure, nominal, x.group.posture)) for x in spectra]
-    records = [torque_record(nominal, x.group, problem.sampling) for x in spectra]
-
-    def cost(offsets: dict[str, np.ndarray]) -> float:
-        par, total = _moved(nominal, offsets), 0.0
-        for x, lin, record in zip(spectra, there, records, strict=True):
+def mean_cost(problem: Problem, spectra: Sequence[Spectra], model: Model) -> float:
+    """Mean of the bounded squares of logarithms over what is looked at, of a model that is linear but for its chain."""
+    structure, par = model.built()
+    total, count = 0.0, 0
+    try:
+        for x in spectra:
+            lin = linearise(structure, equilibrium(structure, par, x.group.posture))
+            record = torque_record(par, x.group, problem.sampling)
             Z = record[:, None, None] * impedance(structure, par, lin, 1j * x.group.omega, x.group.steps)[0]
             torque = np.matmul(Z, x.position[..., None])[..., 0]
             with np.errstate(divide="ignore", invalid="ignore"):
-                square = np.abs(np.log(torque / x.torque)) ** 2
-            total += float(np.sum((square / (1.0 + square))[x.seen]))
-        return total
-
-    return cost
+                square = np.abs(np.log(torque / x.torque)[x.seen]) ** 2
+            total, count = total + float(np.sum(square / (1.0 + square))), count + len(square)
+    except NOT_COMPUTED:
+        return np.inf
+    return total / count

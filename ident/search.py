@@ -13,7 +13,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS, implausible
+from ident.afresh import sought_afresh
+from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS, bent
 from ident.coordinates import stepped
 from ident.costs import weighted_cost
 from ident.evidence import explained, last_is_pointless
@@ -76,8 +77,8 @@ def softened(problem: Problem, current: Fit) -> tuple[Fit, ...]:
     """The model fitted from the starting guesses of the drives under each of the softened weights of ``ANNEALING``; as it
     is with the drives that a problem begins with, where its own cannot be those of the arm: to these they would lead
     again."""
-    if problem.start is not None and implausible(problem, current):
-        begun = replace(current, model=replace(current.model, par=problem.start))
+    if bent(problem, current):
+        begun = replace(current, model=replace(current.model, par=problem.begun))
         return tuple(on_few(problem, begun, rho) for rho in ANNEALING[:-1])
     if current.softer:
         return current.softer
@@ -132,6 +133,8 @@ def explore_softly(
     cold = None if few is problem else [None] * len(problem.groups)
     ways = [(h, r.model, cold or r.remainders, (*ladder, sharp)) for h, r in last]
     ways += [(h, r.model, r.remainders, (sharp,)) for h, r in best_named(direct, FINALISTS, FINALISTS)]
+    if bent(problem, current) and not workers.late:
+        ways += [(h, r.model, r.remainders, (sharp,)) for h, r in sought_afresh(problem, current, hypotheses, workers)]
 
     def sharpened(way: tuple[Hypothesis, Model, Sequence[np.ndarray | None], tuple[Weights, ...]]) -> Fit | None:
         _, model, remainders, steps = way

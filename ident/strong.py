@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, astray, begun_again, implausible
+from ident.baseline import DETECTION_EXCESS, astray, begun_again, bent, implausible
 from ident.costs import joint_costs, noise_costs
 from ident.evidence import last_is_pointless
 from ident.hypotheses import Hypothesis
@@ -100,7 +100,7 @@ def beside_strong(
     if not any(h.key == key and settled(r) for h, r in pairs):
         pairs += tried([s for s in chosen if s.hypothesis.joint != likely])
     unanswered = left_by([*ranked, *pairs]) > UNANSWERED * before.count
-    if chosen and unanswered and implausible(problem, before) and not workers.late:
+    if chosen and unanswered and (bent(problem, before) or implausible(problem, before)) and not workers.late:
         elsewhere = set(range(problem.structure.n)) - quiet - {loudest, likely}
         pairs += tried([s for s in strong_effects(problem, before, scores, elsewhere) if is_spring(s)])
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
