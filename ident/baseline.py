@@ -10,7 +10,7 @@ import numpy as np
 import scipy.stats
 
 from ident.graybox import Parameters
-from ident.log_spectra import begun_by_logarithms, looked_at, mean_cost, valley
+from ident.log_spectra import KNOWN, begun_by_logarithms, credible, looked_at, mean_cost, valley
 from ident.model import Effect, Model
 from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
@@ -25,8 +25,6 @@ RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline 
 DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive among the parameters
 ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
-IMPLAUSIBLE = 4.0  # factor between a drive figure and its starting guess
-GUESSED = 20.0  # the same where that follows from the bodies that a joint carries, within a factor of about five
 LAST_STEPS = 8  # at most, under the noise that the baseline sees itself
 RENEWALS = 3  # at most, of that noise
 # natural logarithm of a drive figure, up to which a fit has moved so little that its noise is its own
@@ -118,14 +116,7 @@ def astray(problem: Problem, result: Fit) -> np.ndarray:
     """(n,) whether a gear has ended far from its starting guess."""
     par, guess = result.model.par, problem.nominal
     far = [np.abs(np.log(a / b)) for a, b in ((par.stiffness, guess.stiffness), (par.damping, guess.damping))]
-    return (far[0] > credible(problem)) | (far[1] > np.log(ASTRAY) + credible(problem) - np.log(IMPLAUSIBLE))
-
-
-def credible(problem: Problem) -> np.ndarray:
-    """(n,) natural logarithm of the factor between a drive figure and its starting guess, up to which it may be that of
-    the arm."""
-    robot = problem.structure.robot
-    return np.log(np.where(np.isin(robot.joint_names, guessed_drives(robot)), GUESSED, IMPLAUSIBLE))
+    return (far[0] > credible(problem)) | (far[1] > np.log(ASTRAY) + credible(problem) - np.log(KNOWN))
 
 
 def discrepancy_p_value(result: Fit) -> float:
@@ -173,7 +164,7 @@ def bent(problem: Problem, result: Fit) -> bool:
     with."""
     if problem.start is None:
         return False
-    near = np.full(problem.structure.n, np.log(IMPLAUSIBLE))
+    near = np.full(problem.structure.n, np.log(KNOWN))
     return implausible(problem, result) or _far(problem, result, problem.start, near)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -29,7 +28,9 @@ SWEEPS = 4  # over all drives, at most, of each step
 STEPS = (1.6, 1.15, 1.05)  # factor from one value of a figure to the next
 NEAR = 3  # of the finer ones tried on either side
 BETTER = 0.01  # share of the cost by which a sweep must lower it for another one
-KNOWN, GUESSED = 4.0, 20.0  # factor from the starting guess, at most, of a drive that is known, and of one that is not
+# factor between a drive figure and its starting guess, up to which it may be that of the arm: of one that is known, and
+# of one that follows from the bodies that a joint carries, within a factor of about five
+KNOWN, GUESSED = 4.0, 20.0
 FIELDS = ("stiffness", "inertia", "damping", "viscous")
 
 
@@ -59,40 +60,72 @@ def begun_by_logarithms(problem: Problem) -> Parameters:
     return valley(problem, spectra, Model(problem.structure, problem.nominal))[0].par if spectra else problem.nominal
 
 
+def credible(problem: Problem) -> np.ndarray:
+    """(n,) natural logarithm of the factor between a drive figure and its starting guess, up to which it may be that of
+    the arm."""
+    robot = problem.structure.robot
+    return np.log(np.where(np.isin(robot.joint_names, guessed_drives(robot)), GUESSED, KNOWN))
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A coordinate of the search.
+
+    Attributes:
+        start: where it begins.
+        reach: how far from zero it may go.
+        unit: of its steps, over those of a logarithm.
+        early: whether it shows before resonances are in their places, as no damper does.
+    """
+
+    start: float
+    reach: float
+    unit: float
+    early: bool
+
+    def values(self, x: float, step: float, whole: bool) -> np.ndarray:
+        """Those to try: the ``whole`` reach, or a few near ``x``."""
+        most = int(2.0 * self.reach / (step * self.unit)) if whole else NEAR
+        each = x + step * self.unit * np.arange(-most, most + 1)
+        return each[np.abs(each) <= self.reach]
+
+
+def axes_of(problem: Problem, model: Model) -> list[Axis]:
+    """Logarithms of drives over the nominal ones, field by field, and offsets of the parameters of a last effect."""
+    axes = [
+        Axis(float(np.log(start / guess)), float(reach), 1.0, field in FIELDS[:2])
+        for field in FIELDS
+        for start, guess, reach in zip(
+            getattr(model.par, field), getattr(problem.nominal, field), credible(problem), strict=True
+        )
+    ]
+    for q in model.effects[-1].hypothesis.parameters if model.effects else ():
+        reach, unit = (np.log(GUESSED), 1.0) if q.log else (2.0 * q.spread, q.spread / (2.0 * np.log(STEPS[0])))
+        axes.append(Axis(0.0, float(reach), float(unit), not q.nuisance))
+    return axes
+
+
 def valley(problem: Problem, spectra: Sequence[Spectra], model: Model) -> tuple[Model, float]:
     """A model with drives near the nominal ones, and with a last effect that changes the chain near its own start, if it
-    has one, at which logarithms agree best; and what it costs, 0 to 1."""
-    n, nominal = problem.structure.n, problem.nominal
-    effect = model.effects[-1] if model.effects else None
-    drives = np.array([getattr(model.par, field) / getattr(nominal, field) for field in FIELDS])
-    guessed = np.isin(problem.structure.robot.joint_names, guessed_drives(problem.structure.robot))
-    reach = [*np.tile(np.log(np.where(guessed, GUESSED, KNOWN)), len(FIELDS))]
-    start, unit = [*np.log(drives).ravel()], [1.0] * (len(FIELDS) * n)
-    shows = [k < 2 * n for k in range(len(FIELDS) * n)]  # dampers show once resonances are in their places
-    for q in effect.hypothesis.parameters if effect else ():
-        start.append(0.0)
-        unit.append(1.0 if q.log else q.spread / np.log(STEPS[0]) / 2.0)
-        reach.append(np.log(GUESSED) if q.log else 2.0 * q.spread)
-        shows.append(not q.nuisance)
-    made = partial(_made, model, nominal)
-    cost = partial(mean_cost, problem, spectra)
-    x, best = np.array(start), cost(made(np.array(start)))
+    has one, at which logarithms agree best; and what it costs, 0 to 1.
+
+    Along one coordinate after another, that of the effect first: over all that may be, then in finer steps.
+    """
+    axes = axes_of(problem, model)
+    x = np.array([axis.start for axis in axes])
+    best, cost = model, mean_cost(problem, spectra, model)
     for step in np.log(STEPS):
         whole = step == np.log(STEPS[0])
         for _ in range(SWEEPS):
-            before = best
-            for k in range(len(x))[::-1]:
-                if whole and not shows[k]:
-                    continue
-                most = NEAR if not whole else int(2.0 * reach[k] / (step * unit[k]))
-                each = x[k] + step * unit[k] * np.arange(-most, most + 1)
-                others = [np.where(np.arange(len(x)) == k, v, x) for v in each[np.abs(each) <= reach[k]]]
-                costs = [cost(made(other)) for other in others]
-                if costs and min(costs) < best:
-                    best, x = min(costs), others[int(np.argmin(costs))]
-            if best > (1.0 - BETTER) * before:
+            before = cost
+            for k, axis in reversed(list(enumerate(axes))):
+                for value in axis.values(x[k], step, whole) if axis.early or not whole else ():
+                    other = _made(model, problem.nominal, np.where(np.arange(len(x)) == k, value, x))
+                    if (found := mean_cost(problem, spectra, other)) < cost:
+                        cost, best, x[k] = found, other, value
+            if cost > (1.0 - BETTER) * before:
                 break
-    return made(x), best
+    return best, cost
 
 
 def _made(model: Model, nominal: Parameters, x: np.ndarray) -> Model:
