@@ -7,7 +7,6 @@ All drive figures are referred to the link side of the gear.
 from __future__ import annotations
 
 import os
-import re
 import sysconfig
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,27 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from robot_assets.drives import read_drives
 from robot_assets.errors import DataError
-from robot_assets.guesses import guess_joints
-from robot_assets.joint import ENCODER, NOISE, VELOCITY, WINDUP, Joint
-from robot_assets.spelling import NAMES, joint_tables
-from robot_assets.urdf import Description, read_urdf
-from robot_assets.values import MISSING, exists, number, read_toml, show, subtable, tables, text, vector
+from robot_assets.joint import Joint
+from robot_assets.spelling import joint_tables
+from robot_assets.urdf import read_urdf
+from robot_assets.values import exists, number, read_toml, show, subtable, tables, text, vector
 
 ASSETS = Path(__file__).parent
-# Figures of a joint by other names that they go by.
-OTHER_NAMES = {
-    "gear_ratio": ("gear", "ratio"),
-    "stiffness": ("spring_stiffness", "gear_stiffness"),
-    "damping": ("spring_damping", "gear_damping"),
-    "viscous_friction": ("motor_viscous_friction", "motor_viscous", "viscous"),
-    "torque_limit": ("torque_max", "effort_limit"),
-    "velocity_limit": ("velocity_max",),
-    "q_std": ("q_noise_std",),
-    "tau_std": ("tau_noise_std",),
-}
-OF_DRIVE = ("gear_ratio", "motor_inertia", "stiffness", "damping", "viscous_friction")
-DRIVE = re.compile(rf"(?m)^[ \t]*\[\[[ \t]*(?:{'|'.join(NAMES)})[ \t]*\]\]")  # begins the table of one
 
 
 @dataclass(frozen=True)
@@ -130,12 +116,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
         if name not in tree.limits:
             raise DataError("joint", where, name, f"a movable joint of {urdf.name}: {sorted(tree.limits)}")
     locked_at = {name: number(locked, name, where) for name in locked}
-    bare = [not any(_given(entry, figure) for figure in OF_DRIVE[1:]) for entry in entries]
-    guesses = [g.joint for g in guess_joints(urdf, tree, names, locked_at)] if any(bare) else [None] * len(names)
-    joints = tuple(
-        _joint(entry, where, tree, guess if nothing else None)
-        for entry, guess, nothing in zip(entries, guesses, bare, strict=True)
-    )
+    joints, guessed = read_drives(path, entries, locked_at, urdf, tree)
     hinges = tuple(_elasticity(e, where, names) for e in tables(data, "elasticity", where))
     _distinct([h.name for h in hinges], "[[elasticity]] names", where)
     payload_link = data.get("payload_link", data.get("flange", tree.child[names[-1]]))
@@ -156,7 +137,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
         q_min=np.array([tree.limits[n][0] for n in names]),
         q_max=np.array([tree.limits[n][1] for n in names]),
         description=str(data.get("description", "")),
-        guessed=_guessed(path, entries, joints, tree),
+        guessed=guessed,
     )
 
 
@@ -221,62 +202,6 @@ def _distinct(names: list[str], what: str, where: str) -> None:
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
         raise DataError(what, where, f"{double[0]} twice", "distinct names")
-
-
-def _given(entry: dict, figure: str) -> list[str]:
-    """The names by which the table of a joint gives a figure."""
-    return [name for name in (figure, *OTHER_NAMES.get(figure, ())) if name in entry]
-
-
-def _guessed(
-    path: Path, entries: list[dict], joints: tuple[Joint, ...], tree: Description
-) -> dict[str, tuple[str, ...]]:
-    drives = DRIVE.split(path.read_text(encoding="utf-8-sig"))[1:]
-    drives += [""] * (len(joints) - len(drives))
-
-    def marked(figure: str) -> re.Pattern[str]:
-        aliases = "|".join((figure, *OTHER_NAMES.get(figure, ())))
-        return re.compile(rf"(?m)^[ \t]*({aliases})[ \t]*=[^#\n]*#.*\bGUESS\b")
-
-    def unknown(figure: str, joint: Joint, entry: dict, drive: str) -> bool:
-        if figure == "torque_limit" and not _given(entry, figure):
-            return joint.torque_limit != tree.efforts[joint.name]
-        return not _given(entry, figure) or bool(marked(figure).search(drive))
-
-    each = list(zip(joints, entries, drives, strict=False))
-    return {
-        figure: tuple(joint.name for joint, entry, drive in each if unknown(figure, joint, entry, drive))
-        for figure in (*OF_DRIVE, "torque_limit")
-    }
-
-
-def _joint(entry: dict, where: str, tree: Description, guess: Joint | None) -> Joint:
-    """A joint from its table, and from ``guess`` where that says nothing of its drive: where it says some figures, one
-    that is not among them is missed."""
-    name = entry["name"]
-    where, linear = f"{where} joint {name}", tree.kinds[name] == "prismatic"
-
-    def figure(key: str, default: Any = MISSING) -> float:
-        default = default if guess is None else getattr(guess, key)
-        used = _given(entry, key)
-        if len(used) > 1:
-            raise DataError(used[1], where, f"{used[0]} beside it", "one of the two: they are the same")
-        return number(entry, used[0] if used else key, where, low=0.0, above=True, default=default)
-
-    stiffness = figure("stiffness")
-    torque_limit = figure("torque_limit", tree.efforts.get(name) or WINDUP * stiffness)
-    return Joint(
-        name=name,
-        gear_ratio=figure("gear_ratio"),
-        motor_inertia=figure("motor_inertia"),
-        stiffness=stiffness,
-        damping=figure("damping"),
-        viscous_friction=figure("viscous_friction"),
-        torque_limit=torque_limit,
-        velocity_limit=figure("velocity_limit", tree.speeds.get(name) or VELOCITY[linear]),
-        q_std=figure("q_std", ENCODER[linear]),
-        tau_std=figure("tau_std", NOISE * torque_limit),
-    )
 
 
 def _elasticity(entry: dict, where: str, joints: list[str]) -> Elasticity:

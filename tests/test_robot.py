@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from robot_assets.drives import OTHER_NAMES
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import draft_robot
-from robot_assets.robot import OTHER_NAMES, load_robot
+from robot_assets.robot import load_robot
 
 
 def test_ur10_has_the_documented_figures(ur10):
