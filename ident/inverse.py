@@ -44,6 +44,7 @@ REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends 
 # in which the change must halve: where no motion repeats the search for one does not end. Large motions of links that
 # are hardly damped take a direction of the search for each resonant line, and more than forty steps for a half.
 STALL_STEPS = 45
+STALL_STEPS_OF_LAWS = 12  # the same where each step solves laws of gears too, and takes far longer
 ROOM = 1 << 29  # bytes for past steps
 NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
 LEAST_KEPT = 0.1  # of the torque, that its record keeps of any line
@@ -239,6 +240,7 @@ def solve(
         W, enough = static_remainder(structure, par, plane, group), REMAINDER_CHANGE
     if react is not None:
         torques = _settle(structure, par, plane, Q, W, torques, react, passes)
+    patience = STALL_STEPS if react is None else STALL_STEPS_OF_LAWS
     left, changes = np.arange(len(W)), []
     past: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(steps):
@@ -256,17 +258,17 @@ def solve(
         off = np.abs(change[left]).max(axis=(1, 2)) / max(np.abs(W).max(), ROUNDING * np.abs(group.U).max())
         moving = off > enough
         changes.append(off.max())
-        if not np.any(moving) or stalled(changes):
+        if not np.any(moving) or stalled(changes, patience):
             break
         if not np.all(moving):
             left, past = left[moving], [(x[moving], f[moving]) for x, f in past]
     return _solution(structure, par, plane, Q, W, torques)
 
 
-def stalled(changes: Sequence[float]) -> bool:
-    """Whether the last ``STALL_STEPS`` changes of a search for a fixed point have none below half of all before."""
-    last, before = changes[-STALL_STEPS:], changes[:-STALL_STEPS]
-    return len(before) >= STALL_STEPS and min(last) > 0.5 * min(before)
+def stalled(changes: Sequence[float], patience: int = STALL_STEPS) -> bool:
+    """Whether the last so many changes of a search for a fixed point have none below half of all before."""
+    last, before = changes[-patience:], changes[:-patience]
+    return len(before) >= patience and min(last) > 0.5 * min(before)
 
 
 def _settle(
