@@ -40,7 +40,7 @@ from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import apply_change
 from ident.identification import identify
-from ident.inverse import REMAINDER_STEPS, STALL_STEPS, plane_at, solve, stalled
+from ident.inverse import REMAINDER_STEPS, STALL_STEPS, STALL_STEPS_OF_LAWS, plane_at, solve, stalled
 from ident.model import Effect, along_record
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
@@ -1340,6 +1340,8 @@ def test_a_start_far_off_the_data_is_not_fitted_but_for_the_best(identified, nam
 def test_a_search_for_a_motion_that_does_not_repeat_is_given_up(ratio, expected):
     changes = [ratio**i for i in range(4 * STALL_STEPS)]
     assert stalled(changes) is expected and not stalled(changes[: 2 * STALL_STEPS - 1])
+    few = changes[: 4 * STALL_STEPS_OF_LAWS]  # that are enough where each solves laws of gears too
+    assert stalled(few, STALL_STEPS_OF_LAWS) is expected and not stalled(few)
 
 
 @pytest.mark.slow
