@@ -19,7 +19,7 @@ from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import Fit, anneal
 
 SOUGHT = "base_elasticity", "payload", "link_inertia"
-PLACES = 0.425, 0.13  # resonances that a base is begun at, over the highest line
+PLACES = 0.425, 0.13  # resonances over the highest line, from which hinges are sought: in the band, and below
 RATIO = 0.05  # of damping there
 LIGHT = 0.03  # of the mass of the arm, that a payload is begun at
 TELLS = 0.7  # mean cost of logarithms over that without a change, up to which a change is fitted

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.stats
 
 from ident.graybox import Parameters
-from ident.log_spectra import KNOWN, begun_by_logarithms, credible, looked_at, mean_cost, valley
+from ident.log_spectra import FIELDS, KNOWN, begun_by_logarithms, credible, looked_at, mean_cost, valley
 from ident.model import Effect, Model
 from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import ANNEALING, Fit, anneal, fit
@@ -22,7 +22,6 @@ JOINT_EXCESS = 1.25  # the same of a single joint
 JOINT_CHANCE = 4.0  # standard deviations of that by chance, which few data leave
 ERROR_OF_LAWS = 0.01  # of what causes explain at a joint, left there by errors of their laws
 RESTART_DAMPING = (1.0, 10.0)  # factors on the dampers from which the baseline is fitted again
-DRIVE = ("stiffness", "damping", "inertia", "viscous")  # figures of a drive among the parameters
 ASTRAY = 10.0  # factor between a damper and its starting guess, beyond which the gear begins again
 HOPELESS = 3e3  # chi2 per degree of freedom that no damper can have caused
 LAST_STEPS = 8  # at most, under the noise that the baseline sees itself
@@ -44,13 +43,16 @@ def fit_baseline(
     """
     guessed = bool(guessed_drives(problem.structure.robot))
 
-    def begun(by_logarithms: bool, ladder: Sequence[float] = ANNEALING) -> Fit:
-        """Fitted from the nominal drives, or from those of ``begun_by_logarithms`` and near these at first."""
-        from_there = replace(problem, nominal=begun_by_logarithms(problem)) if by_logarithms else problem
-        model = Model(problem.structure, from_there.nominal, effects)
-        return anneal(from_there, model, ladder=ladder, progress=progress)
+    def told() -> Problem:
+        """The problem with the drives of ``begun_by_logarithms`` as those near which a fit is held at first."""
+        return replace(problem, nominal=begun_by_logarithms(problem))
 
-    best = first = begun(guessed)
+    def begun(there: Problem, ladder: Sequence[float] = ANNEALING) -> Fit:
+        """Fitted from the nominal drives of a problem."""
+        return anneal(there, Model(there.structure, there.nominal, effects), ladder=ladder, progress=progress)
+
+    here = told() if guessed else problem
+    best = first = begun(here)
     softer = first.softer
 
     def again(par: Parameters) -> Fit:
@@ -65,8 +67,8 @@ def fit_baseline(
         )
 
     if best.chi2_per_dof > DETECTION_EXCESS:
-        rest = first if problem.motions_alone else begun(not guessed)
-        best = min(first, begun(guessed, ANNEALING[1:]), rest, key=lambda f: (np.sum(astray(problem, f)), f.cost))
+        rest = first if problem.motions_alone else begun(problem if guessed else told())
+        best = min(first, begun(here, ANNEALING[1:]), rest, key=lambda f: (np.sum(astray(problem, f)), f.cost))
         softer = rest.softer if best is rest else first.softer
     if DETECTION_EXCESS < best.chi2_per_dof < HOPELESS:
         for factor in RESTART_DAMPING:
@@ -98,7 +100,7 @@ def renewed(problem: Problem, result: Fit, progress: Callable[[str], None] | Non
 
 def begun_again(problem: Problem, par: Parameters, lost: np.ndarray) -> Parameters:
     """Parameters with the drives of some joints (n,) back at where they began."""
-    return replace(par, **{name: np.where(lost, getattr(problem.begun, name), getattr(par, name)) for name in DRIVE})
+    return replace(par, **{name: np.where(lost, getattr(problem.begun, name), getattr(par, name)) for name in FIELDS})
 
 
 def start_of(problem: Problem, result: Fit) -> Parameters | None:

@@ -3,8 +3,9 @@
 From guesses that are off by more than about a half, resonances of a model lie beside those of the arm, and least squares
 of torques lead away: a resonance at the wrong place costs more than none, and gears end a hundred times too soft or too
 stiff. The logarithm of predicted over measured torque is the same for a pole and a zero (as in LLS: Wernholt and Moberg,
-Automatica 47, 2011), and bounded here as of a robust estimator (Geman and McClure 1987), so that lines which the wrong resonances spoil do not outvote the others. It
-has one broad valley, which a search along one drive figure after another finds.
+Automatica 47, 2011), and bounded here as of a robust estimator (Geman and McClure 1987), so that lines which the wrong
+resonances spoil do not outvote the others. It has one broad valley, which a search along one drive figure after another
+finds.
 """
 
 from __future__ import annotations

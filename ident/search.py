@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ident.afresh import sought_afresh
+from ident.afresh import PLACES, RATIO, sought_afresh
 from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS, bent
 from ident.coordinates import stepped
 from ident.costs import weighted_cost
@@ -53,7 +53,6 @@ DECOYS = 4  # decoys, at most
 PER_EFFECT = 2  # of one effect, at most
 NEAR_HINGE = 1.0 / 3.0  # screened gain of a hinge, relative to the best one, above which it is refitted too
 NEAR_BODY = 1.0 / 3.0  # the same of a body's inertia, where one answers best
-MID_RESONANCE, MID_RATIO = 0.425, 0.05  # of a hinge that screening does not place: over the highest line, damping
 KEEP_RATIO = 0.02  # screened gain, relative to the best, below which nothing is refitted
 MIN_SHARE = 0.35  # share of what is left unexplained that a cause must explain
 WORTH_A_REFIT = 0.05  # share of the excess that a screened gain must explain: linear steps understate strong effects
@@ -365,11 +364,9 @@ def hinges_everywhere(problem: Problem, preds: Sequence[Prediction], scores: Seq
     The gears have taken up the best part of one that is missing: a linear step from there has a wrong sign, or
     answers at another joint.
     """
-    middle = MID_RESONANCE * signal_scale(problem, preds, 0, ()).highest_line
+    middle = PLACES[0] * signal_scale(problem, preds, 0, ()).highest_line
     hinges = [s for s in scores if "hinge" in s.hypothesis.options]
     return [
-        replace(
-            s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, MID_RATIO), step=None
-        )
+        replace(s, start=s.hypothesis.options["hinge"](problem.structure, problem.groups[0], middle, RATIO), step=None)
         for s in hinges
     ]
