@@ -292,6 +292,15 @@ def roll_off_note(problem: Problem) -> str:
     )
 
 
+def chosen_motion_note(records: Sequence[str]) -> str:
+    """Held-out records that are predicted in the steady motion that their torque tells (``gain.in_recorded_motion``)."""
+    those = records[0] if len(records) == 1 else f"{len(records)} held-out records, {records[0]} first"
+    return (
+        f"A gear that bends lets the arm swing in more than one steady motion: in {those}, the model is in the one that the recorded"
+        " torque tells, not in the one that it reaches from rest."
+    )
+
+
 def step_note(steps: TimeSteps) -> str:
     """Records of a simulation that steps in time, as of ``time_steps.TimeSteps``."""
     return (

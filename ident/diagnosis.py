@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ident.attribute import Attribution, attribute
 from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed
-from ident.conclude import conclude, named_effects, nameless_law, roll_off_note, step_note
+from ident.conclude import chosen_motion_note, conclude, named_effects, nameless_law, roll_off_note, step_note
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, ratio_interval, segment_errors
@@ -124,16 +124,19 @@ def diagnose_fully(
         affected = affected_joints(problem, baseline, first) if found.detected else ()
         return held_out(setup, nominal, baseline, found, rigid is not None, affected, method, workers)
 
-    gain, shown, pairs = tested(result)
+    test = tested(result)
     notes: list[str] = []
-    if gain is not None and gain.worse:
+    if test.gain is not None and test.gain.worse:
         names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
         notes.append(
-            f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of"
-            f" {gain.before:.3g} {torque_unit(dataset.robot, gain.joints)}."
+            f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {test.gain.after:.3g} in place of"
+            f" {test.gain.before:.3g} {torque_unit(dataset.robot, test.gain.joints)}."
         )
         result, rigid = result.without_causes(), None
-        gain, shown, pairs = tested(result)
+        test = tested(result)
+    gain = test.gain
+    if test.told_by_torque:
+        notes.append(chosen_motion_note(test.told_by_torque))
     say("evidence")
     last = predictions(problem, result.final.model, result.final.remainders)
     late = find_link_delays(recorded, last, problem.sampling.sample_time)
@@ -182,7 +185,7 @@ def diagnose_fully(
             ),
             *([] if left is None else [left.plot]),
         ),
-        traces=torque_traces(shown, pairs),
+        traces=torque_traces(test.shown, test.pairs),
         parameters={k: v.value for k, v in verdict.baseline.items()},
         seconds=time.perf_counter() - began,
         next_plan=separating.plan if separating else None,
@@ -195,8 +198,19 @@ def diagnose_fully(
     )
 
 
-HeldOut = tuple[Gain | None, tuple[Group, ...], list[tuple[Prediction, Prediction]]]
-"""Gain, and the groups that are shown with their predictions before and after."""
+@dataclass(frozen=True)
+class HeldOut:
+    """Gain on data that no model was fitted to.
+
+    Attributes:
+        shown, pairs: groups to be shown, and their predictions before and after.
+        told_by_torque: as of ``Errors``.
+    """
+
+    gain: Gain | None
+    shown: tuple[Group, ...]
+    pairs: Sequence[tuple[Prediction, Prediction]]
+    told_by_torque: tuple[str, ...] = ()
 
 
 def held_out(
@@ -222,10 +236,11 @@ def held_out(
         gain = measure_gain(
             errors, units_of_torques(problem.structure.robot), affected, method, np.random.default_rng(SEED)
         )
-        return gain, tuple(g for g in setup.held_out if g.segments[0] in errors.segments), pairs
+        shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
+        return HeldOut(gain, shown, pairs, errors.told_by_torque)
     gain = leave_one_out(setup, nominal, baseline, result, renewed, affected, workers)
-    shown = problem.groups[:1]
-    return gain, shown, [(predict(before, g, problem.sampling), predict(after, g, problem.sampling)) for g in shown]
+    g = problem.groups[0]
+    return HeldOut(gain, (g,), [(predict(before, g, problem.sampling), predict(after, g, problem.sampling))])
 
 
 def tones_of(recorded: Sequence[Group], found: Sequence[Prediction]) -> tuple[Tone, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 
 import numpy as np
 
@@ -29,16 +29,19 @@ class Errors:
     n).
 
     ``segments``: of the rows, a motion as often as it has stretches, a single periodic record as often as it has lines.
+    ``told_by_torque``: records whose steady motion after is one that their torque told.
     """
 
     segments: tuple[str, ...]
     before: np.ndarray
     after: np.ndarray
     noise: np.ndarray
+    told_by_torque: tuple[str, ...] = field(default=(), kw_only=True)
 
 
-def in_recorded_motion(pred: Prediction) -> Prediction:
-    """A prediction in which each record makes that of several steady motions which its torque tells.
+def in_recorded_motion(pred: Prediction) -> tuple[Prediction, tuple[str, ...]]:
+    """A prediction in which each record makes that of several steady motions which its torque tells, and the records
+    that make another than the one predicted.
 
     Under a law of the gear that bends, as a cubic one, the links may swing in two ways along one motion of the motors;
     begun from nothing the model may find the other.
@@ -46,7 +49,7 @@ def in_recorded_motion(pred: Prediction) -> Prediction:
     model, group = pred.model, pred.group
     bent = [e.hypothesis.channel == "spring" and "bends" in e.hypothesis.options for e in model.effects]
     if group.window is not None or not any(bent):
-        return pred
+        return pred, ()
     along = tuple(
         replace(e, hypothesis=along_record(e.hypothesis)) if bends else e
         for e, bends in zip(model.effects, bent, strict=True)
@@ -55,17 +58,16 @@ def in_recorded_motion(pred: Prediction) -> Prediction:
         told = predict(replace(model, effects=along), group, pred.sampling).solution
         other = predict(model, group, pred.sampling, W=told.W, torques=told.torques, steps=REMAINDER_STEPS)
         left, left_by_other = (np.sum(np.abs(group.observe(group.U - p.U)) ** 2, axis=(1, 2)) for p in (pred, other))
-        nearer = (left_by_other < left)[:, None, None]
+        nearer = left_by_other < left
         if not np.any(nearer):
-            return pred
-        a, b = pred.solution, other.solution
-        torques = Torques(
-            *(np.where(nearer, y, x) for x, y in zip(astuple(a.torques), astuple(b.torques), strict=True))
-        )
-        W = np.where(nearer, b.W, a.W)
-        return predict(model, group, pred.sampling, W=W, torques=torques, steps=REMAINDER_STEPS)
+            return pred, ()
+        a, b, here = pred.solution, other.solution, nearer[:, None, None]
+        torques = Torques(*(np.where(here, y, x) for x, y in zip(astuple(a.torques), astuple(b.torques), strict=True)))
+        W = np.where(here, b.W, a.W)
+        chosen = predict(model, group, pred.sampling, W=W, torques=torques, steps=REMAINDER_STEPS)
     except NOT_COMPUTED:
-        return pred
+        return pred, ()
+    return chosen, tuple(group.segments[i] for i in np.flatnonzero(nearer))
 
 
 def segment_errors(
@@ -89,12 +91,14 @@ def segment_errors(
     names: list[str] = []
     out: list[list[np.ndarray]] = [[], [], []]
     pairs = []
+    told: tuple[str, ...] = ()
     for group in groups:
         try:
             a = predict(before, group, problem.sampling)
-            b = in_recorded_motion(predict(after, group, problem.sampling))
+            b, by_torque = in_recorded_motion(predict(after, group, problem.sampling))
         except FloatingPointError:
             continue
+        told += by_torque
         pairs.append((a, b))
         S = as_held(noise_covariance(problem, group, b), held_share(b, group))
         share = group.window_share
@@ -112,7 +116,7 @@ def segment_errors(
             store.append((mean_squares(np.abs(e) ** 2) if parts == 1 else stretch_squares(group, e, parts)) / share)
         out[2].append(np.repeat(mean_squares(noise[None]) / share, parts * len(group.segments), axis=0))
     joined = (np.concatenate(x) if x else np.zeros((0, len(problem.nominal.stiffness))) for x in out)
-    return Errors(tuple(names), *joined), pairs
+    return Errors(tuple(names), *joined, told_by_torque=told), pairs
 
 
 def mean_squares(lines: np.ndarray) -> np.ndarray:

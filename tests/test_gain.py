@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ident import gain
+from ident.conclude import chosen_motion_note
 from ident.diagnosis import diagnose
 from ident.gain import Errors, line_squares, mean_squares, measure_gain
 from ident.model import Effect, Model
@@ -125,7 +126,7 @@ def test_a_cause_that_harms_held_out_data_is_taken_back(locked, tmp_path):
 def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(monkeypatch):
     """Of two records one is met by a start from nothing, and one by a start from what the recorded torque says."""
     measured = np.zeros((2, 3, 1), complex)
-    group = SimpleNamespace(U=measured, window=None, observe=lambda X: X)
+    group = SimpleNamespace(U=measured, segments=("first", "second"), window=None, observe=lambda X: X)
     law = SimpleNamespace(channel="spring", options={"bends": lambda p, f, k: p * f})
     model = Model(None, None, (Effect(law, np.array([1.0])),))
     monkeypatch.setattr(gain, "along_record", lambda h: SimpleNamespace(channel="spring", options={"along": True}))
@@ -143,8 +144,9 @@ def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(mon
         return predicted(model, W[:, 0, 0])
 
     monkeypatch.setattr(gain, "predict", predict)
-    found = gain.in_recorded_motion(predicted(model, [0.2, 7.0]))
+    found, told = gain.in_recorded_motion(predicted(model, [0.2, 7.0]))
+    assert told == ("second",) and "in second," in chosen_motion_note(told)
     assert found.U[:, 0, 0].real == pytest.approx([0.2, 0.1])
     linear = replace(model, effects=())
     start = predicted(linear, [0.2, 7.0])
-    assert gain.in_recorded_motion(start) is start
+    assert gain.in_recorded_motion(start) == (start, ())

@@ -3,6 +3,7 @@
 import json
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from inspect import signature
 from multiprocessing import get_context
 
@@ -67,6 +68,13 @@ def test_a_search_without_time_says_so_and_names_nothing(friction):
     assert verdict.unexplained_verdict == "unknown cause remains"
     assert "0 s for the search" in verdict.notes[-1]
     assert json.loads(friction[1])["notes"] == []
+
+
+def test_drives_that_were_fitted_from_guesses_are_told(friction):
+    data = friction[0]
+    robot = replace(data.robot, guessed=data.robot.guessed | {"motor_inertia": ("drive",)})
+    (note,) = (x for x in diagnose(replace(data, robot=robot), max_seconds=0.0).notes if "guesses" in x)
+    assert "drives of drive " in note
 
 
 @pytest.mark.parametrize("text", ["", "cores", "processes:0", "processes:two", "dask://", "dask:host", "threads:2"])
