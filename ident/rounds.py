@@ -30,6 +30,7 @@ from ident.torque_fit import Fit
 SETTLED = 0.05  # share of the excess up to which what is left needs no second search
 # of what a decoy explains, that a law of the catalogue must, to take its place as long as causes are missing
 NEARLY = 0.95
+FAR_FROM_NOISE = 2.0  # chi2 per degree of freedom of such a law, beside a decoy that leaves noise alone
 NEXT_LEAVES = 0.1  # of what the best candidate leaves, that a linear step of another cause may leave of it
 # share of what a cause explains that errors of its law leave at other joints, over that at its own, at most
 PASSED_ON = 10.0
@@ -84,12 +85,15 @@ def with_name(found: Round) -> Round:
     """A round that a decoy has won, won by the law of the catalogue that it holds, or by one that explains nearly as
     much.
 
-    Beside causes that are still missing what sets them apart means little: the decoy is a rival again at the end.
+    Beside causes that are still missing what sets them apart means little: the decoy is a rival again at the end. Where
+    the decoy leaves noise alone none is missing, and it stays where the others leave far more.
     """
     best, *others = found.candidates
     first = best.hypothesis
     if not first.decoy or first.options.get("baseline"):
         return found
+    if settled(best.fit):
+        others = [c for c in others if c.fit.chi2_per_dof <= FAR_FROM_NOISE]
     named = [c for c in others if c.hypothesis.key == (first.options.get("absorbs"), first.place)]
     if not named:
         least = NEARLY * found.fall

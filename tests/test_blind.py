@@ -232,6 +232,20 @@ def test_a_base_that_leans_is_no_cause_of_the_catalogue(ur10, tmp_path):
     assert result.candidates[0][0][:2] == ("unknown:leaning_base", "base")
 
 
+def test_torque_of_a_neighbour_is_no_cause_of_the_catalogue(locked, tmp_path):
+    """A record that shows a share of it, which a drive that delivers such a share looks like: no gears are coupled."""
+    plan = small_plan(locked, 9, points=2, levels=(1.0,), period=1000)
+    data = quick_experiment(plan, [], seed=9, drives=draw_drives(np.random.default_rng(9), locked))
+    shown = np.eye(3)
+    shown[2, 1] = 0.04
+    data = replace(data, segments=tuple(replace(s, tau=s.tau @ shown.T) for s in data.segments))
+    result = diagnose_fully(through_files(data, tmp_path))
+    assert result.verdict.discrepancy.detected and result.verdict.unexplained_verdict == UNKNOWN
+    assert all(c.probability <= 0.5 for c in result.verdict.causes)
+    assert result.candidates[0][0][:2] == ("unknown:crosstalk", "elbow_joint")
+    assert "0.04 times that of shoulder_lift_joint" in result.verdict.residual_description
+
+
 @pytest.mark.slow
 def test_a_gear_under_which_held_out_records_swing_in_two_ways_is_named(ur10, tmp_path):
     """One of these records swings in the way that the model does not find from nothing."""

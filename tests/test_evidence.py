@@ -103,6 +103,12 @@ def replace_costs(fit, costs):
     return SimpleNamespace(**{**vars(fit), "cost": float(np.sum(costs)), "costs": costs})
 
 
+def coupling(structure, motor, turned):
+    return next(
+        h for h in catalogue(structure) if h.effect == "joint_coupling" and h.options["joints"] == (motor, turned)
+    )
+
+
 @pytest.mark.parametrize(
     ("motor", "turned"),
     [("shoulder_lift_joint", "elbow_joint"), ("wrist_1_joint", "wrist_3_joint"), ("wrist_2_joint", "elbow_joint")],
@@ -111,7 +117,7 @@ def test_a_coupling_of_any_two_joints_is_screened_by_its_derivative(identified, 
     """Against the difference of two arms at one posture."""
     _, setup, result = identified
     group = setup.problem.groups[0]
-    h = next(h for h in catalogue(setup.problem.structure) if h.options.get("joints") == (motor, turned))
+    h = coupling(setup.problem.structure, motor, turned)
     bare = predictions(setup.problem, result.model, result.remainders)[0]
     (unit,) = h.options["responses"](bare.structure, bare.par, bare.plane, group, bare.solution, ())
     step = 1e-4
@@ -197,10 +203,13 @@ def test_a_decoy_that_holds_a_law_steps_back_behind_it_and_is_told_of(named):
     rub, decoy = named["coulomb_friction", "elbow_joint"], named["unknown:position_friction", "elbow_joint"]
     elsewhere = named["coulomb_friction", "wrist_1_joint"]
 
-    def round_of(*members, left=500.0):
-        """Of 1000 to explain the first leaves nothing, and the others ``left``."""
+    def round_of(*members, left=500.0, noise=5.0):
+        """Of 1000 to explain the first leaves nothing, and the others ``left``, beside so many times the noise."""
         costs = [left * (i > 0) for i in range(len(members))]
-        fits = [SimpleNamespace(cost=x, costs=np.array([x])) for x in costs]
+        model = SimpleNamespace(effects=())
+        fits = [
+            SimpleNamespace(cost=x, costs=np.array([x]), chi2_per_dof=noise + x / 100.0, model=model) for x in costs
+        ]
         named = tuple(Candidate(h, x, 0.0, p) for (h, p), x in zip(members, fits, strict=True))
         return Round(SimpleNamespace(cost=1000.0, costs=np.array([1000.0])), named, (), 1.0, 1.0)
 
@@ -212,6 +221,10 @@ def test_a_decoy_that_holds_a_law_steps_back_behind_it_and_is_told_of(named):
     assert with_name(clear) is clear and not outdone(clear)
     near = with_name(round_of((named["unknown:rising_friction", "elbow_joint"], 0.9), (rub, 0.1), left=30.0))
     assert near.candidates[0].hypothesis is rub and outdone(near)
+    # Where a decoy leaves noise alone no cause is missing beside what does not.
+    for left, kept in ((500.0, True), (50.0, False)):
+        whole = with_name(round_of((decoy, 0.8), (rub, 0.2), left=left, noise=1.0))
+        assert (whole.candidates[0].hypothesis is decoy) is kept and outdone(whole) is not kept
 
 
 def test_a_power_of_the_speed_at_its_bounds_is_the_friction_of_the_catalogue(named):
@@ -392,9 +405,7 @@ def test_a_coupling_winds_the_gear_up_by_all_that_its_motor_has_turned(identifie
     """The joint that is turned too stands elsewhere, and there the arm is another."""
     _, setup, result = identified
     problem, value = setup.problem, 1e-4
-    (h,) = (
-        x for x in catalogue(problem.structure) if x.options.get("joints") == ("shoulder_lift_joint", "elbow_joint")
-    )
+    h = coupling(problem.structure, "shoulder_lift_joint", "elbow_joint")
     preds = predictions(problem, result.model, result.remainders, steps=8)
     effects = (Effect(h, np.array([value])),)
     moved = predictions(problem, replace(result.model, effects=effects), result.remainders, steps=8)
@@ -409,11 +420,7 @@ def test_a_coupling_winds_the_gear_up_by_all_that_its_motor_has_turned(identifie
 
 def test_a_coupling_of_any_size_costs_what_it_is_known_by(identified):
     """As other effects that are one number do; not its share of all ratios that there may be."""
-    (h,) = (
-        x
-        for x in catalogue(identified[1].problem.structure)
-        if x.options.get("joints") == ("wrist_1_joint", "wrist_2_joint")
-    )
+    h = coupling(identified[1].problem.structure, "wrist_1_joint", "wrist_2_joint")
     for size in (1e-3, 0.1):
         known = 3.0 / size**2 * 1e4  # to a hundredth
         assert occam(candidate(h, [size], [known]), TEMPER) == pytest.approx(

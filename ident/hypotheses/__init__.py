@@ -77,6 +77,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
             out.append(sensing.encoder_eccentricity(j, name, robot.joints[j].gear_ratio))
     for j, k in itertools.permutations(range(len(names)), 2):
         out.append(structure.joint_coupling(j, k, names[j], names[k]))
+        out.append(drive.crosstalk(j, names[j], k, names[k]))
     if robot.payload_link in chain.bodies:
         out.append(bodies.payload(robot.payload_link))
     seen: set[int] = set()

@@ -14,6 +14,7 @@ from ident.motion import Motion, Recorded
 
 KNEE = Parameter("knee", "1", 2e-3, 0.2, log=True, nuisance=True, step=0.02, center=0.03, spread=1.5, reported=True)
 SCALE = Parameter("scale", "1", 0.2, 5.0, log=True, null=1.0)  # delivered torque over the recorded one
+CROSSTALK = 0.05  # of the torque of another motor, that is expected
 MOST_RIPPLE = 0.5  # of the torque of a motor, that ripples with it
 LEAST_LIMIT = 0.3  # of the peak torque of a record: below, no loop would hold the arm
 
@@ -211,6 +212,31 @@ def torque_curve(joint: int, place: str) -> Hypothesis:
         screen,
         "The motor of {joint} delivers less of a torque the larger that is, at torques of any size.",
         variable="torque",
+    )
+
+
+def crosstalk(joint: int, place: str, other: int, beside: str) -> Hypothesis:
+    """Decoy: motor ``joint`` delivers a share of what motor ``other``, at ``beside``, is asked for too; or the record of
+    its torque shows that share of the other's, as currents that are measured side by side do.
+
+    A coupling of the gears turns the other joint as well.
+    """
+
+    def asked(motion: Recorded) -> np.ndarray:
+        return motion.group.torque_share[..., other] * motion.group.U[..., other]
+
+    return Hypothesis(
+        "unknown:crosstalk",
+        place,
+        joint,
+        "drive",
+        (Parameter("share", "1", -1.0, 1.0, spread=CROSSTALK),),
+        lambda p, motion, j, k, U: U - p[0] * asked(motion),
+        lambda scale: [()],
+        lambda motion, j, k, shape: Screen((-asked(motion),), np.array),
+        "The torque of {joint} goes with {share:.4g} times that of {turned}, which it does not turn.",
+        variable="torque",
+        options={"joints": (place, beside)},
     )
 
 

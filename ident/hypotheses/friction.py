@@ -28,6 +28,7 @@ LEAST_DIP = 1.15  # static friction over Coulomb's, below which it is as good as
 MOST_DIP = 10.0  # the same, beyond which nothing rubs in motion: no friction of a bearing
 # of the velocity in the fall of a Stribeck friction
 DIP = Parameter("exponent", "1", 0.5, 2.0, log=True, nuisance=True, step=1e-2, center=2.0, spread=0.5, reported=True)
+OF_A_DIP = {"apart": "stribeck_velocity", "shown": "static", "exceeds": ("static", "coulomb")}  # options of its laws
 TURN_SHARE = 2e-3  # velocity within which a friction turns over that of its dip, at first
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
@@ -256,12 +257,10 @@ def stribeck_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
         screen,
         "The residual torque of {joint} falls from {static:.3g} N m at rest to {coulomb:.3g} N m above"
         " {stribeck_velocity:.2g} rad/s: friction with a Stribeck dip.",
-        options={
+        options=OF_A_DIP
+        | {
             "absorbs": "coulomb_friction",
             "absorb": absorb,
-            "apart": "stribeck_velocity",
-            "shown": "static",
-            "exceeds": ("static", "coulomb"),
             "bristled": lambda p, s: [
                 np.array([*p[:3], p[1] / (give * max(s.q, LEAST_MOTION)), p[4], 0.0]) for give in GIVES
             ],
@@ -313,12 +312,10 @@ def bristled_stribeck(joint: int, place: str) -> Hypothesis:
             (f * scale.v, give * max(scale.q, LEAST_MOTION)) for f in (0.15, 0.5) for give in (0.003, 0.03)
         ],
         screen=screen,
-        options={
+        options=OF_A_DIP
+        | {
             "absorbs": "presliding_friction",
             "absorb": absorb,
-            "apart": "stribeck_velocity",
-            "shown": "static",
-            "exceeds": ("static", "coulomb"),
             "special": lambda p: np.array([p[3], p[0], DAHL, p[5]]),
             "trivial": lambda p, k: p[1] <= LEAST_DIP * p[0],
             "widens": lambda p, s: [
