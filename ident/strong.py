@@ -43,6 +43,7 @@ CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that o
 FAR_BEHIND = 1.5  # cost at its joint of a law along the record over that of the best candidate, beyond which it is out
 HARDLY_LESS = 0.9  # of what is left without a strong effect under softened weights, for that to explain anything
 UNANSWERED = 30.0  # chi2 per degree of freedom that the best may leave before laws of the gear are sought at all joints
+ANSWERED = 0.05  # share of that up to which a law of the gear answers what nothing did
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 
 
@@ -62,7 +63,8 @@ def beside_strong(
     gear along the record, where nothing depends on how a loop moves under parameters that are not right yet, and then
     as loops where these do as well. Those at the joint of the best candidate come first, and last where its own law
     leaves noise alone. A gear that bends turns the links of others too, and their drives with them to where any joint
-    may be the loudest: where these cannot be those of the arm, and nothing answers, laws of the gear are sought at all.
+    may be the loudest: where these cannot be those of the arm, and nothing answers, laws of the gear are sought at one
+    joint after the other, until one leaves noise.
 
     Args:
         quiet: joints at which none is sought.
@@ -102,7 +104,21 @@ def beside_strong(
     unanswered = left_by([*ranked, *pairs]) > UNANSWERED * before.count
     if chosen and unanswered and (bent(problem, before) or implausible(problem, before)) and not workers.late:
         elsewhere = set(range(problem.structure.n)) - quiet - {loudest, likely}
-        pairs += tried([s for s in strong_effects(problem, before, scores, elsewhere) if is_spring(s)])
+        laws = [s for s in strong_effects(problem, before, scores, elsewhere) if is_spring(s)]
+        for joint in dict.fromkeys(s.hypothesis.joint for s in laws):  # that of the best score first
+            at_joint = tried([s for s in laws if s.hypothesis.joint == joint])
+            pairs += at_joint
+            print(
+                "XX",
+                joint,
+                left_by(at_joint),
+                left_by([*ranked]),
+                before.count,
+                [(h.effect, r.cost, r.chi2_per_dof) for h, r in at_joint],
+                flush=True,
+            )
+            if left_by(at_joint) < ANSWERED * left_by(ranked):
+                break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     # Noise along the record is taken large: a law that leaves as much even in that as no law, or clearly more than the
     # best, is far off.

@@ -9,21 +9,10 @@ from typing import Any
 from robot_assets.errors import DataError
 from robot_assets.guesses import guess_joints
 from robot_assets.joint import ENCODER, NOISE, VELOCITY, WINDUP, Joint
-from robot_assets.spelling import NAMES
+from robot_assets.spelling import NAMES, given_names, names_of
 from robot_assets.urdf import Description
 from robot_assets.values import MISSING, number
 
-# Figures of a joint by other names that they go by.
-OTHER_NAMES = {
-    "gear_ratio": ("gear", "ratio"),
-    "stiffness": ("spring_stiffness", "gear_stiffness"),
-    "damping": ("spring_damping", "gear_damping"),
-    "viscous_friction": ("motor_viscous_friction", "motor_viscous", "viscous"),
-    "torque_limit": ("torque_max", "effort_limit"),
-    "velocity_limit": ("velocity_max",),
-    "q_std": ("q_noise_std",),
-    "tau_std": ("tau_noise_std",),
-}
 OF_DRIVE = ("gear_ratio", "motor_inertia", "stiffness", "damping", "viscous_friction")
 DRIVE = re.compile(rf"(?m)^[ \t]*\[\[[ \t]*(?:{'|'.join(NAMES)})[ \t]*\]\]")  # begins the table of one
 
@@ -41,18 +30,13 @@ def read_drives(
         DataError: where a figure is wrong, or misses beside others of the same drive.
     """
     names = [entry["name"] for entry in entries]
-    bare = [not any(_given(entry, figure) for figure in OF_DRIVE[1:]) for entry in entries]
+    bare = [not any(given_names(entry, figure) for figure in OF_DRIVE[1:]) for entry in entries]
     guesses = [g.joint for g in guess_joints(urdf, tree, names, locked)] if any(bare) else [None] * len(names)
     joints = tuple(
         _joint(entry, str(path), tree, guess if nothing else None)
         for entry, guess, nothing in zip(entries, guesses, bare, strict=True)
     )
     return joints, _guessed(path, entries, joints, tree)
-
-
-def _given(entry: dict, figure: str) -> list[str]:
-    """The names by which the table of a joint gives a figure."""
-    return [name for name in (figure, *OTHER_NAMES.get(figure, ())) if name in entry]
 
 
 def _guessed(
@@ -63,13 +47,13 @@ def _guessed(
     drives += [""] * (len(joints) - len(drives))
 
     def marked(figure: str) -> re.Pattern[str]:
-        aliases = "|".join((figure, *OTHER_NAMES.get(figure, ())))
+        aliases = "|".join(names_of(figure))
         return re.compile(rf"(?m)^[ \t]*({aliases})[ \t]*=[^#\n]*#.*\bGUESS\b")
 
     def unknown(figure: str, joint: Joint, entry: dict, drive: str) -> bool:
-        if figure == "torque_limit" and not _given(entry, figure):
+        if figure == "torque_limit" and not given_names(entry, figure):
             return joint.torque_limit != tree.efforts[joint.name]
-        return not _given(entry, figure) or bool(marked(figure).search(drive))
+        return not given_names(entry, figure) or bool(marked(figure).search(drive))
 
     each = list(zip(joints, entries, drives, strict=False))
     return {
@@ -86,7 +70,7 @@ def _joint(entry: dict, where: str, tree: Description, guess: Joint | None) -> J
 
     def figure(key: str, default: Any = MISSING) -> float:
         default = default if guess is None else getattr(guess, key)
-        used = _given(entry, key)
+        used = given_names(entry, key)
         if len(used) > 1:
             raise DataError(used[1], where, f"{used[0]} beside it", "one of the two: they are the same")
         return number(entry, used[0] if used else key, where, low=0.0, above=True, default=default)

@@ -17,9 +17,9 @@ import numpy as np
 from robot_assets.drives import read_drives
 from robot_assets.errors import DataError
 from robot_assets.joint import Joint
-from robot_assets.spelling import joint_tables
+from robot_assets.spelling import joint_tables, load_tables, some_tables
 from robot_assets.urdf import read_urdf
-from robot_assets.values import exists, number, read_toml, show, subtable, tables, text, vector
+from robot_assets.values import exists, number, read_toml, show, subtable, text, vector
 
 ASSETS = Path(__file__).parent
 
@@ -117,7 +117,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
             raise DataError("joint", where, name, f"a movable joint of {urdf.name}: {sorted(tree.limits)}")
     locked_at = {name: number(locked, name, where) for name in locked}
     joints, guessed = read_drives(path, entries, locked_at, urdf, tree)
-    hinges = tuple(_elasticity(e, where, names) for e in tables(data, "elasticity", where))
+    hinges = tuple(_elasticity(e, where, names) for e in some_tables(data, "elasticity", where))
     _distinct([h.name for h in hinges], "[[elasticity]] names", where)
     payload_link = data.get("payload_link", data.get("flange", tree.child[names[-1]]))
     if not isinstance(payload_link, str) or (payload_link and payload_link not in tree.links):
@@ -129,7 +129,7 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
         urdf=urdf,
         joints=joints,
         elasticities=hinges,
-        loads=tuple(_load(e, where, tree.links) for e in tables(data, "load", where)),
+        loads=tuple(_load(e, where, tree.links, payload_link) for e in load_tables(data, where)),
         locked=locked_at,
         gravity=(float(gx), float(gy), float(gz)),
         mesh_dir=mesh_dir,
@@ -217,8 +217,8 @@ def _elasticity(entry: dict, where: str, joints: list[str]) -> Elasticity:
     return Elasticity(name, joint, (float(x), float(y), float(z)), stiffness, damping)
 
 
-def _load(entry: dict, where: str, links: frozenset[str]) -> Load:
-    link = entry.get("link")
+def _load(entry: dict, where: str, links: frozenset[str], payload_link: str) -> Load:
+    link = entry.get("link", payload_link)
     if not isinstance(link, str) or link not in links:
         raise DataError("[[load]] link", where, show(link), f"one of {sorted(links)}")
     where = f"{where} load of {link}"

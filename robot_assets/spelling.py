@@ -1,7 +1,8 @@
-"""The drives of a ``robot.toml`` in the ways in which people write them down: each as the table of one joint.
+"""The drives and loads of a ``robot.toml`` in the ways in which people write them down: each as a table of its own.
 
-``[[joint]]`` is the way of this project. What else says the same without doubt is read too: another name of the array,
-a table of each joint by its name, lists in the order of the joints, or a list of the joints and their drives apart.
+``[[joint]]`` and ``[[load]]`` are the way of this project. What else says the same without doubt is read too: another
+name of the array, one table where there is one, a table of each joint by its name, lists in the order of the joints, or
+a list of the joints and their drives apart.
 """
 
 from __future__ import annotations
@@ -12,7 +13,23 @@ from robot_assets.errors import DataError
 from robot_assets.values import show, subtable, tables
 
 NAMES = ("joint", "joints", "drive", "drives")
-NOISE = ("q_std", "tau_std")
+LOADS = ("load", "loads", "payload", "payloads")
+# Figures of a joint by other names that they go by.
+OTHER_NAMES = {
+    "gear_ratio": ("gear", "ratio"),
+    "stiffness": ("spring_stiffness", "gear_stiffness"),
+    "damping": ("spring_damping", "gear_damping"),
+    "viscous_friction": ("motor_viscous_friction", "motor_viscous", "viscous"),
+    "torque_limit": ("torque_max", "effort_limit"),
+    "velocity_limit": ("velocity_max",),
+    "q_std": ("q_noise_std",),
+    "tau_std": ("tau_noise_std",),
+}
+# Tables of figures for all joints or a list of one for each, by the names that these have there.
+OF_ALL = {
+    "noise": {"q_std": "q_std", "tau_std": "tau_std"},
+    "limits": {"effort": "torque_limit", "torque": "torque_limit", "velocity": "velocity_limit"},
+}
 
 
 def joint_tables(data: dict[str, Any], where: str) -> list[dict[str, Any]]:
@@ -30,7 +47,36 @@ def joint_tables(data: dict[str, Any], where: str) -> list[dict[str, Any]]:
         entries = _in_order(data, data[listed[0]], used, where)
     else:
         entries = _entries(data, used, where)
-    return _with_noise(entries, subtable(data, "noise", where), where)
+    for table, figures in OF_ALL.items():
+        entries = _with_figures(entries, table, subtable(data, table, where), figures, where)
+    return entries
+
+
+def load_tables(data: dict[str, Any], where: str) -> list[dict[str, Any]]:
+    """The tables of the known loads.
+
+    Raises:
+        DataError: where they are written in two ways.
+    """
+    used = [key for key in LOADS if key in data and (key == LOADS[0] or isinstance(data[key], dict | list))]
+    if len(used) > 1:
+        raise DataError(f"[[{used[1]}]]", where, f"[[{used[0]}]] beside it", "the loads in one place")
+    return some_tables(data, used[0], where) if used else []
+
+
+def some_tables(data: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
+    """An array of tables, or the table where there is one; empty where the key is absent."""
+    return tables({key: [data[key]]} if isinstance(data.get(key), dict) else data, key, where)
+
+
+def names_of(figure: str) -> tuple[str, ...]:
+    """The names that a figure of a joint goes by."""
+    return (figure, *OTHER_NAMES.get(figure, ()))
+
+
+def given_names(entry: dict[str, Any], figure: str) -> list[str]:
+    """The names by which the table of a joint gives a figure."""
+    return [name for name in names_of(figure) if name in entry]
 
 
 def _in_order(data: dict[str, Any], names: list[str], used: list[str], where: str) -> list[dict[str, Any]]:
@@ -76,17 +122,23 @@ def _of_lists(lists: dict[str, Any], names: list[str], where: str) -> list[dict[
     return [{"name": name, **{k: v[i] for k, v in lists.items()}} for i, name in enumerate(names)]
 
 
-def _with_noise(entries: list[dict[str, Any]], noise: dict[str, Any], where: str) -> list[dict[str, Any]]:
-    """Noise as a dataset names it, ``[noise]`` with a figure for all or one for each, given to joints that have none."""
-    given = {k: noise[k] for k in NOISE if k in noise}
-    for key, values in given.items():
-        if isinstance(values, list) and len(values) != len(entries):
-            raise DataError(f"[noise] {key}", where, show(values), f"a number, or a list of {len(entries)}")
-
-    def of(i: int) -> dict[str, Any]:
-        return {k: v[i] if isinstance(v, list) else v for k, v in given.items()}
-
-    return [{**of(i), **entry} for i, entry in enumerate(entries)]
+def _with_figures(
+    entries: list[dict[str, Any]], table: str, given: dict[str, Any], figures: dict[str, str], where: str
+) -> list[dict[str, Any]]:
+    """Figures of a table for all joints, as ``[noise]`` of a dataset, given to those that have none of their own."""
+    for key, figure in figures.items():
+        if key not in given:
+            continue
+        values = given[key]
+        if not isinstance(values, list):
+            values = [values] * len(entries)
+        if len(values) != len(entries):
+            raise DataError(f"[{table}] {key}", where, show(values), f"a number, or a list of {len(entries)}")
+        entries = [
+            entry if given_names(entry, figure) else {**entry, figure: value}
+            for entry, value in zip(entries, values, strict=True)
+        ]
+    return entries
 
 
 def _all(values: Any, kind: type) -> bool:

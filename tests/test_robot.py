@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robot_assets.drives import OTHER_NAMES
 from robot_assets.errors import DataError
 from robot_assets.from_urdf import draft_robot
 from robot_assets.robot import load_robot
+from robot_assets.spelling import OTHER_NAMES
 
 
 def test_ur10_has_the_documented_figures(ur10):
@@ -126,6 +126,32 @@ def test_drives_are_read_in_each_way_of_writing_them_down(tmp_path, drives):
     assert robot.array("q_std").tolist() == [2e-6, 2e-6] and robot.array("tau_std").tolist() == [0.1, 0.02]
 
 
+DRIVES = f"[drives]\n{NAMED}{LISTS}"
+LOAD = "mass = 3.0\ncom = [0.0, 0.1, 0.0]\n"
+
+
+@pytest.mark.parametrize(
+    "loads",
+    [f'[[load]]\nlink = "l1"\n{LOAD}', f'[load]\nlink = "l1"\n{LOAD}', f"payload_link = 'l1'\n[payload]\n{LOAD}"],
+)
+def test_a_load_is_read_in_each_way_of_writing_it_down(tmp_path, loads):
+    """That of a link or, where none is said, at the flange."""
+    (load,) = load_robot(planar(tmp_path, loads + DRIVES)).loads
+    assert (load.link, load.mass, load.com.tolist()) == ("l1", 3.0, [0.0, 0.1, 0.0])
+
+
+def test_limits_for_all_joints_give_way_to_those_of_one(tmp_path):
+    limits = "payload = 150\n[limits]\neffort = [9.0, 8.0]\nvelocity = 2.0\n"
+    robot = load_robot(
+        planar(
+            tmp_path,
+            f'{limits}[[joint]]\nname = "shoulder"\ntorque_max = 7.0\n{EACH[0]}[[joint]]\nname = "elbow"\n{EACH[1]}',
+        )
+    )
+    assert robot.array("torque_limit").tolist() == [7.0, 8.0] and robot.array("velocity_limit").tolist() == [2.0, 2.0]
+    assert not robot.loads and not robot.guessed["torque_limit"]
+
+
 @pytest.mark.parametrize(
     ("drives", "found"),
     [
@@ -139,6 +165,8 @@ def test_drives_are_read_in_each_way_of_writing_them_down(tmp_path, drives):
         (f"[[drive]]\n{EACH[0]}", "no such key"),
         (f"[[drive]]\njoint = 3\n{EACH[0]}", "3"),
         ("joint = 3", "3"),
+        (f"{DRIVES}[load]\n{LOAD}[[loads]]\n{LOAD}", "[[load]] beside it"),
+        (f"{DRIVES}[limits]\neffort = [1.0]", "[1.0]"),
         (f'{LISTED}[[drive]]\njoint = "shoulder"\n{EACH[0]}', "drives of ['shoulder']"),
         (LISTED + f'[[drive]]\njoint = "elbow"\n{EACH[0]}' * 2, "drives of ['elbow', 'elbow']"),
         (f"{LISTED}[[drive]]\n{EACH[0]}[[joint]]\n{EACH[1]}", "[[joint]] beside it"),
