@@ -48,6 +48,7 @@ FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which 
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 TOLD = 0.2  # standard deviation of the Coulomb friction that drifts over its size, up to which the data show it
 FAR_OFF = 1.5  # error of held-out data over their noise, from which it is told
+ALONG = 0.8  # error of held-out data along the record over that of a simulation, below which both are told
 RIVAL = 0.1  # of the probability of a cause, above which the sentence tells a rival too
 
 
@@ -78,10 +79,12 @@ def conclude(
     rigid: RigidFit | None = None,
     belied: Collection[tuple[str, str]] = (),
     tones: Sequence[Tone] = (),
+    judged: Gain | None = None,
 ) -> Verdict:
     """Put the result into the words and numbers of verdict.json.
 
     Args:
+        judged: the gain that names are trusted by (``gain.Errors.seen_along``); ``gain`` itself where None.
         baseline: the first model, and ``first`` what it predicts.
         belied: causes, by ``key``, that held-out data deny (``trust.denied``).
         tones: what does not repeat with the period. Where nothing else is found it is an unknown cause.
@@ -90,8 +93,9 @@ def conclude(
     final = result.final
     tones = of_their_own(tones, final)
     left = result.left_share if result.detected else 0.0
-    halved = gain is not None and gain.method == LEFT_OUT and len({g.operating_point for g in problem.groups}) < 3
-    refuted = result.unknown or fails_held_out(gain, final, left, halved) or patchwork(named_effects(final))
+    judged = judged or gain
+    halved = judged is not None and judged.method == LEFT_OUT and len({g.operating_point for g in problem.groups}) < 3
+    refuted = result.unknown or fails_held_out(judged, final, left, halved) or patchwork(named_effects(final))
     unknown = result.detected and (
         refuted
         or (left > LEFT_SHARE and final.chi2_per_dof > LEFT_NOISE)
@@ -109,7 +113,7 @@ def conclude(
         share = left_of(effect.hypothesis, result)
         # Other motions meet whatever else the description of an arm lacks.
         if not (problem.motions_alone or halved):
-            share = max(share, left_on_held_out(effect.hypothesis, gain))
+            share = max(share, left_on_held_out(effect.hypothesis, judged))
         trust = known_probability(share, doubted)
         trust *= explained_share(found, final)
         doubtful = (
@@ -289,6 +293,17 @@ def roll_off_note(problem: Problem) -> str:
         f"The recorded torque is {abs(lost):.2%} too {'small' if lost > 0.0 else 'large'} at {omega / 2.0 / np.pi:.3g} Hz,"
         " by the square of the frequency and alike at all joints. That is taken for the recorder, which averages samples or"
         " holds them, and not for a cause."
+    )
+
+
+def along_note(gain: Gain, judged: Gain) -> tuple[str, ...]:
+    """Where a gear rattles: what the extended model leaves along the record, by which its law is trusted."""
+    if not judged.after < ALONG * gain.after:
+        return ()
+    unit = gain.metric.rpartition(", ")[2]
+    return (
+        f"The gear has more steady motions than the model is led to: simulated it leaves {gain.after:.3g} {unit} on held-out data, along the record"
+        f" of the torque {judged.after:.3g}. Its law is trusted by the latter.",
     )
 
 

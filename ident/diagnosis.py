@@ -11,7 +11,15 @@ import numpy as np
 
 from ident.attribute import Attribution, attribute
 from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed
-from ident.conclude import chosen_motion_note, conclude, named_effects, nameless_law, roll_off_note, step_note
+from ident.conclude import (
+    along_note,
+    chosen_motion_note,
+    conclude,
+    named_effects,
+    nameless_law,
+    roll_off_note,
+    step_note,
+)
 from ident.dataset import Dataset
 from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, ratio_interval, segment_errors
@@ -126,7 +134,7 @@ def diagnose_fully(
 
     test = tested(result)
     notes: list[str] = []
-    if test.gain is not None and test.gain.worse:
+    if test.gain is not None and test.judged is not None and test.judged.worse:
         names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
         notes.append(
             f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {test.gain.after:.3g} in place of"
@@ -134,9 +142,11 @@ def diagnose_fully(
         )
         result, rigid = result.without_causes(), None
         test = tested(result)
-    gain = test.gain
+    gain, judged = test.gain, test.judged
     if test.told_by_torque:
         notes.append(chosen_motion_note(test.told_by_torque))
+    if gain is not None and judged is not None:
+        notes += along_note(gain, judged)
     say("evidence")
     last = predictions(problem, result.final.model, result.final.remainders)
     late = find_link_delays(recorded, last, problem.sampling.sample_time)
@@ -144,7 +154,20 @@ def diagnose_fully(
     belied = {r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)}
     tones = tones_of(recorded, last)
     verdict = conclude(
-        dataset, problem, setup.steps, baseline, result, gain, first, last, late, separating, rigid, belied, tones
+        dataset,
+        problem,
+        setup.steps,
+        baseline,
+        result,
+        gain,
+        first,
+        last,
+        late,
+        separating,
+        rigid,
+        belied,
+        tones,
+        judged,
     )
     left = None
     if verdict.unexplained_verdict == UNKNOWN and result.detected:  # tones alone are told by themselves
@@ -203,11 +226,13 @@ class HeldOut:
     """Gain on data that no model was fitted to.
 
     Attributes:
+        judged: the same for what names are trusted by, of ``Errors.seen_along``.
         shown, pairs: groups to be shown, and their predictions before and after.
         told_by_torque: as of ``Errors``.
     """
 
     gain: Gain | None
+    judged: Gain | None
     shown: tuple[Group, ...]
     pairs: Sequence[tuple[Prediction, Prediction]]
     told_by_torque: tuple[str, ...] = ()
@@ -233,14 +258,19 @@ def held_out(
     problem, before, after = setup.problem, baseline.model, result.final.model
     if setup.held_out:
         errors, pairs = segment_errors(problem, setup.held_out, before, after)
-        gain = measure_gain(
-            errors, units_of_torques(problem.structure.robot), affected, method, np.random.default_rng(SEED)
-        )
         shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
-        return HeldOut(gain, shown, pairs, errors.told_by_torque)
-    gain = leave_one_out(setup, nominal, baseline, result, renewed, affected, workers)
-    g = problem.groups[0]
-    return HeldOut(gain, (g,), [(predict(before, g, problem.sampling), predict(after, g, problem.sampling))])
+    else:
+        left_out = leave_one_out(setup, nominal, baseline, result, renewed, workers)
+        g = problem.groups[0]
+        shown, pairs = (g,), [(predict(before, g, problem.sampling), predict(after, g, problem.sampling))]
+        if left_out is None:
+            return HeldOut(None, None, shown, pairs)
+        errors, method = left_out, LEFT_OUT
+    units = units_of_torques(problem.structure.robot)
+    gain, judged = (
+        measure_gain(x, units, affected, method, np.random.default_rng(SEED)) for x in (errors, errors.seen_along())
+    )
+    return HeldOut(gain, judged, shown, pairs, errors.told_by_torque)
 
 
 def tones_of(recorded: Sequence[Group], found: Sequence[Prediction]) -> tuple[Tone, ...]:
@@ -457,10 +487,9 @@ def leave_one_out(
     baseline: Fit,
     result: Attribution,
     renewed: bool,
-    affected: Sequence[int],
     workers: Workers = Workers(),
-) -> Gain | None:
-    """Gain by leaving out one operating point after another, both models refitted without it.
+) -> Errors | None:
+    """Errors on one operating point after another, both models refitted without it; None of a single one.
 
     Args:
         nominal: starting guesses of the drives.
@@ -486,10 +515,4 @@ def leave_one_out(
             models.append(refitted(replace(problem, nominal=nominal), kept, start, found, remainders))
         return segment_errors(problem, left_out, *models, alone=False)[0]
 
-    return measure_gain(
-        joined(workers.map(without, points)),
-        units_of_torques(problem.structure.robot),
-        affected,
-        LEFT_OUT,
-        np.random.default_rng(SEED),
-    )
+    return joined(workers.map(without, points))

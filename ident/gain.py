@@ -29,7 +29,8 @@ class Errors:
     n).
 
     ``segments``: of the rows, a motion as often as it has stretches, a single periodic record as often as it has lines.
-    ``told_by_torque``: records whose steady motion after is one that their torque told.
+    ``told_by_torque``: records whose steady motion after is one that their torque told. ``along``: as ``after``, but
+    along the record where laws of the gear are nearer to that: what they are, whichever motion a loop settles in.
     """
 
     segments: tuple[str, ...]
@@ -37,37 +38,63 @@ class Errors:
     after: np.ndarray
     noise: np.ndarray
     told_by_torque: tuple[str, ...] = field(default=(), kw_only=True)
+    along: np.ndarray | None = field(default=None, kw_only=True)
+
+    def seen_along(self) -> Errors:
+        """The same with the errors after that are left along the record."""
+        return self if self.along is None else replace(self, after=self.along)
 
 
-def in_recorded_motion(pred: Prediction) -> tuple[Prediction, tuple[str, ...]]:
-    """A prediction in which each record makes that of several steady motions which its torque tells, and the records
-    that make another than the one predicted.
+@dataclass(frozen=True)
+class Told:
+    """A prediction in which each record makes that of several steady motions which its torque tells.
+
+    ``records`` (S,) whether one makes another than that which was predicted. ``U`` (S, L, n): the torque along the
+    record, N m, where that is nearer.
+    """
+
+    prediction: Prediction
+    records: np.ndarray
+    U: np.ndarray
+
+
+def in_recorded_motion(pred: Prediction) -> Told:
+    """A prediction in the steady motion that the recorded torque tells.
 
     Under a law of the gear that bends, as a cubic one, the links may swing in two ways along one motion of the motors;
-    begun from nothing the model may find the other.
+    begun from nothing the model may find the other. Where a gear rattles there are many, and the model need not be led
+    to the one that was recorded.
     """
     model, group = pred.model, pred.group
     bent = [e.hypothesis.channel == "spring" and "bends" in e.hypothesis.options for e in model.effects]
+    as_it_is = Told(pred, np.zeros(len(group.U), bool), pred.U)
     if group.window is not None or not any(bent):
-        return pred, ()
+        return as_it_is
     along = tuple(
         replace(e, hypothesis=along_record(e.hypothesis)) if bends else e
         for e, bends in zip(model.effects, bent, strict=True)
     )
     try:
-        told = predict(replace(model, effects=along), group, pred.sampling).solution
-        other = predict(model, group, pred.sampling, W=told.W, torques=told.torques, steps=REMAINDER_STEPS)
-        left, left_by_other = (np.sum(np.abs(group.observe(group.U - p.U)) ** 2, axis=(1, 2)) for p in (pred, other))
-        nearer = left_by_other < left
-        if not np.any(nearer):
-            return pred, ()
-        a, b, here = pred.solution, other.solution, nearer[:, None, None]
-        torques = Torques(*(np.where(here, y, x) for x, y in zip(astuple(a.torques), astuple(b.torques), strict=True)))
-        W = np.where(here, b.W, a.W)
-        chosen = predict(model, group, pred.sampling, W=W, torques=torques, steps=REMAINDER_STEPS)
+        told = predict(replace(model, effects=along), group, pred.sampling)
+        start = told.solution
+        other = predict(model, group, pred.sampling, W=start.W, torques=start.torques, steps=REMAINDER_STEPS)
+        nearer, chosen = _left_of(other) < _left_of(pred), pred
+        if np.any(nearer):
+            a, b, here = pred.solution, other.solution, nearer[:, None, None]
+            torques = Torques(
+                *(np.where(here, y, x) for x, y in zip(astuple(a.torques), astuple(b.torques), strict=True))
+            )
+            W = np.where(here, b.W, a.W)
+            chosen = predict(model, group, pred.sampling, W=W, torques=torques, steps=REMAINDER_STEPS)
     except NOT_COMPUTED:
-        return pred, ()
-    return chosen, tuple(group.segments[i] for i in np.flatnonzero(nearer))
+        return as_it_is
+    off = _left_of(told) < _left_of(chosen)
+    return Told(chosen, nearer, np.where(off[:, None, None], told.U, chosen.U))
+
+
+def _left_of(pred: Prediction) -> np.ndarray:
+    """What a prediction leaves of each record, (S,) N2 m2."""
+    return np.sum(np.abs(pred.group.observe(pred.group.U - pred.U)) ** 2, axis=(1, 2))
 
 
 def segment_errors(
@@ -89,34 +116,35 @@ def segment_errors(
     parts = STRETCHES if motions else 1
     by_line = alone and not motions and sum(len(group.segments) for group in groups) == 1
     names: list[str] = []
-    out: list[list[np.ndarray]] = [[], [], []]
+    out: list[list[np.ndarray]] = [[], [], [], []]
     pairs = []
-    told: tuple[str, ...] = ()
+    by_torque: tuple[str, ...] = ()
     for group in groups:
         try:
             a = predict(before, group, problem.sampling)
-            b, by_torque = in_recorded_motion(predict(after, group, problem.sampling))
+            told = in_recorded_motion(predict(after, group, problem.sampling))
         except FloatingPointError:
             continue
-        told += by_torque
+        b = told.prediction
+        by_torque += tuple(group.segments[i] for i in np.flatnonzero(told.records))
         pairs.append((a, b))
         S = as_held(noise_covariance(problem, group, b), held_share(b, group))
         share = group.window_share
         noise = share * np.einsum("kii->ki", S).real
+        errors = [group.observe(group.U - U) for U in (a.U, b.U, told.U)]
         if by_line:
             names += group.segments * group.n_compared
-            for store, lines in zip(
-                out, (*(np.abs(group.observe(group.U - p.U)[0]) ** 2 for p in (a, b)), noise), strict=True
-            ):
+            for store, lines in zip(out, (*(np.abs(e[0]) ** 2 for e in errors), noise), strict=True):
                 store.append(line_squares(lines))
             continue
         names += [name for name in group.segments for _ in range(parts)]
-        for store, pred in ((out[0], a), (out[1], b)):
-            e = group.observe(group.U - pred.U)
+        for store, e in zip(out, errors, strict=False):
             store.append((mean_squares(np.abs(e) ** 2) if parts == 1 else stretch_squares(group, e, parts)) / share)
-        out[2].append(np.repeat(mean_squares(noise[None]) / share, parts * len(group.segments), axis=0))
-    joined = (np.concatenate(x) if x else np.zeros((0, len(problem.nominal.stiffness))) for x in out)
-    return Errors(tuple(names), *joined, told_by_torque=told), pairs
+        out[3].append(np.repeat(mean_squares(noise[None]) / share, parts * len(group.segments), axis=0))
+    left, left_after, along, floor = (
+        np.concatenate(x) if x else np.zeros((0, len(problem.nominal.stiffness))) for x in out
+    )
+    return Errors(tuple(names), left, left_after, floor, told_by_torque=by_torque, along=along), pairs
 
 
 def mean_squares(lines: np.ndarray) -> np.ndarray:
@@ -171,9 +199,7 @@ def measure_gain(
     by_joint = {name: JointGain(*(float(np.sqrt(np.mean(x[:, j]))) for x in rows)) for j, name in enumerate(joints)}
     pick_joints = list(affected) if len(affected) else list(range(len(joints)))
     n = len(pick_joints)
-    errors = Errors(
-        errors.segments, *(x[:, pick_joints].sum(axis=1) for x in (errors.before, errors.after, errors.noise))
-    )
+    errors = Errors(errors.segments, *(x[:, pick_joints].sum(axis=1) for x in rows))
 
     def rms(x: np.ndarray) -> float:
         return float(np.sqrt(np.mean(x) / n))

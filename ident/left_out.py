@@ -41,7 +41,12 @@ def refitted(
 def joined(errors: Sequence[Errors]) -> Errors:
     """Errors one below the other."""
     names = tuple(name for e in errors for name in e.segments)
-    return Errors(names, *(np.concatenate([getattr(e, f) for e in errors]) for f in ("before", "after", "noise")))
+    by_torque = tuple(name for e in errors for name in e.told_by_torque)
+    before, after, noise, along = (
+        np.concatenate(rows)
+        for rows in zip(*((e.before, e.after, e.noise, e.seen_along().after) for e in errors), strict=True)
+    )
+    return Errors(names, before, after, noise, told_by_torque=by_torque, along=along)
 
 
 def errors_on_parts(problem: Problem, one: Fit, other: Fit, workers: Workers, renewed: bool = False) -> Errors:

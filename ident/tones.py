@@ -1,6 +1,7 @@
 """Tones of the torque that do not repeat with the period: what shakes a joint at a frequency of its own.
 
-Such a tone is in the scatter between periods, where it would count as noise. It stands at one line and leaks to those
+Such a tone is in the scatter between periods, or in what a transient one ends with beside a single steady one, where it
+would count as noise. It stands at one line and leaks to those
 next to it, where noise of samples, carried to the torque by the impedance of the arm, is smooth over lines once that
 impedance is taken off. Where the impedance itself is sharp, links that still swing from how the record began look alike.
 """
@@ -20,6 +21,7 @@ REACH, NEXT = 12, 2  # lines on either side that say what noise is near by, but 
 LOUDEST = 10.0  # power of a line over that of noise near by, from which it is a tone
 QUIETEST = 0.01  # least power of noise near by, over that of all lines
 BY_CHANCE = 1e-9  # probability of such a line in noise anywhere
+SPREAD = 2  # lines on either side, of a spectrum through a window, that a tone reaches
 SHARP = 2.0  # size of the impedance over that two lines away, from which links swing there on their own
 
 
@@ -38,19 +40,19 @@ class Tone:
 
 
 def find_tones(groups: Sequence[Group], impedances: Sequence[np.ndarray]) -> tuple[Tone, ...]:
-    """The loudest tone of each joint that has any, loudest first; of records of several periods.
+    """The loudest tone of each joint that has any, loudest first; of records that show noise alone.
 
     Args:
         impedances: (L, n, n) recorded torque per motor position, by group.
     """
     loudest: dict[int, Tone] = {}
     for group, Z in zip(groups, impedances, strict=True):
-        if group.window is not None or group.U_periods.shape[1] < 2:
+        if not group.shows_noise:
             continue
-        ratio, dof = over_noise(group, Z)
+        ratio, lines, dof = over_noise(group, Z)
         chance = ratio.size * scipy.stats.gamma.sf(dof * ratio, dof)
-        for line, j in np.argwhere((ratio > LOUDEST) & (chance < BY_CHANCE) & ~swinging(Z[: len(ratio)])):
-            tone = Tone(int(j), float(group.omega[line] / (2.0 * np.pi)), float(ratio[line, j]))
+        for i, j in np.argwhere((ratio > LOUDEST) & (chance < BY_CHANCE) & ~_swinging_at(lines, Z, group)):
+            tone = Tone(int(j), float(group.omega[lines[i]] / (2.0 * np.pi)), float(ratio[i, j]))
             if tone.joint not in loudest or tone.ratio > loudest[tone.joint].ratio:
                 loudest[tone.joint] = tone
     return tuple(sorted(loudest.values(), key=lambda t: -t.ratio))
@@ -68,16 +70,26 @@ def swinging(Z: np.ndarray) -> np.ndarray:
     return sharp[:-2] | sharp[1:-1] | sharp[2:]
 
 
-def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, float]:
-    """Power (K, n) of the scatter at each line over that near by, ones at the mean; and its degrees of freedom."""
+def _swinging_at(lines: np.ndarray, Z: np.ndarray, group: Group) -> np.ndarray:
+    """``swinging`` (J, n) at some lines of a period, or at those that a window brings to them."""
+    there = swinging(Z)
+    reach = SPREAD * group.noise_spacing if group.U_periods.shape[1] == 1 else 0
+    near = np.clip(lines[:, None] + np.arange(-reach, reach + 1), 0, len(Z) - 1)
+    return np.any(there[near], axis=1)
+
+
+def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Power (J, n) of noise at each line that shows it alone over that near by, ones at the first; those lines, and its
+    degrees of freedom."""
     noise = noise_alone(group, Z)
-    assert noise is not None  # of several periods
-    d, _, dof = noise
+    assert noise is not None  # of such a group
+    d, lines, dof = noise
+    Z = Z[lines]
     power = np.sum(np.abs(d) ** 2, axis=0)
-    torque, position = white_levels(power[1:], Z[1 : len(power)], np.full(len(power) - 1, dof))
+    torque, position = white_levels(power[1:], Z[1:], np.full(len(power) - 1, dof))
     # What rounding leaves of records without noise is none, and holds no tone.
     torque = torque + ROUNDED**2 * np.mean(np.sum(2.0 * np.abs(group.U) ** 2, axis=1), axis=0)
-    root = np.linalg.cholesky(white_covariance(Z[: len(power)], torque, position))
+    root = np.linalg.cholesky(white_covariance(Z, torque, position))
     white = np.sum(np.abs(np.linalg.solve(root[None], d[..., None])[..., 0]) ** 2, axis=0)
     middle = scipy.stats.gamma.median(dof) / dof  # of the power of lines of noise, over its mean
     padded = np.pad(white[1:], ((REACH, REACH), (0, 0)), constant_values=np.nan)
@@ -85,4 +97,4 @@ def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, float]:
     near = np.delete(around, np.arange(REACH - NEXT, REACH + NEXT + 1), axis=-1)
     ratio = np.ones_like(white)
     ratio[1:] = white[1:] * middle / np.maximum(np.nanmedian(near, axis=-1), QUIETEST)
-    return ratio, dof
+    return ratio, lines, dof

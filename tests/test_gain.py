@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ident import gain
-from ident.conclude import chosen_motion_note
+from ident.conclude import along_note, chosen_motion_note
 from ident.diagnosis import diagnose
 from ident.gain import Errors, line_squares, mean_squares, measure_gain
 from ident.model import Effect, Model
@@ -123,8 +123,12 @@ def test_a_cause_that_harms_held_out_data_is_taken_back(locked, tmp_path):
     assert verdict.gain.before == verdict.gain.after
 
 
-def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(monkeypatch):
-    """Of two records one is met by a start from nothing, and one by a start from what the recorded torque says."""
+@pytest.mark.parametrize(
+    ("rattles", "left", "left_along"), [(False, [0.2, 0.1], [0.2, 0.1]), (True, [0.2, 6.0], [0.2, 0.1])]
+)
+def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(monkeypatch, rattles, left, left_along):
+    """Of two records one is met by a start from nothing, and one by a start from what the recorded torque says: or by
+    none, where the gear rattles, and along the record alone."""
     measured = np.zeros((2, 3, 1), complex)
     group = SimpleNamespace(U=measured, segments=("first", "second"), window=None, observe=lambda X: X)
     law = SimpleNamespace(channel="spring", options={"bends": lambda p, f, k: p * f})
@@ -141,12 +145,25 @@ def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(mon
         if "along" in model.effects[0].hypothesis.options:
             return predicted(model, [5.0, 0.1])
         assert W is torques.spring or np.array_equal(W, torques.spring)
-        return predicted(model, W[:, 0, 0])
+        off = W[:, 0, 0]
+        return predicted(model, np.where(off == 0.1, 6.0, off) if rattles else off)
 
     monkeypatch.setattr(gain, "predict", predict)
-    found, told = gain.in_recorded_motion(predicted(model, [0.2, 7.0]))
-    assert told == ("second",) and "in second," in chosen_motion_note(told)
-    assert found.U[:, 0, 0].real == pytest.approx([0.2, 0.1])
+    told = gain.in_recorded_motion(predicted(model, [0.2, 7.0]))
+    assert told.records.tolist() == [False, True] and "in second," in chosen_motion_note(["second"])
+    assert told.prediction.U[:, 0, 0].real == pytest.approx(left)
+    assert told.U[:, 0, 0].real == pytest.approx(left_along)
     linear = replace(model, effects=())
     start = predicted(linear, [0.2, 7.0])
-    assert gain.in_recorded_motion(start) == (start, ())
+    assert gain.in_recorded_motion(start).prediction is start
+
+
+def test_a_law_that_rattles_is_told_to_be_trusted_along_the_record():
+    errors = Errors(("one", "two"), *(np.full((2, 1), x) for x in (100.0, 25.0, 1.0)), along=np.full((2, 1), 4.0))
+    simulated, along = (
+        measure_gain(x, {"drive": "N m"}, [], "method", np.random.default_rng(0)) for x in (errors, errors.seen_along())
+    )
+    assert (simulated.after, along.after) == (5.0, 2.0) and simulated.gap_closed < 0.6 < along.gap_closed
+    (note,) = along_note(simulated, along)
+    assert "5 N m" in note and "2." in note
+    assert along_note(simulated, simulated) == () and replace(errors, along=None).seen_along().after is errors.after

@@ -341,11 +341,11 @@ def test_what_is_left_out_is_a_posture_with_all_its_records(identified):
     """Records of one posture may differ in their periods, and are groups of their own."""
     setup, baseline = identified
     problem, found = setup.problem, SimpleNamespace(final=baseline)
-    gain = leave_one_out(setup, problem.nominal, baseline, found, False, ())
-    assert gain.segments == tuple(name for g in problem.groups for name in g.segments)
+    errors = leave_one_out(setup, problem.nominal, baseline, found, False)
+    assert errors.segments == tuple(name for g in problem.groups for name in g.segments)
     one = replace(problem, groups=tuple(replace(g, operating_point="op01") for g in problem.groups))
     assert len(one.groups) > 1
-    assert leave_one_out(replace(setup, problem=one), problem.nominal, baseline, found, False, ()) is None
+    assert leave_one_out(replace(setup, problem=one), problem.nominal, baseline, found, False) is None
 
 
 def test_the_end_of_a_motion_is_held_out_where_it_is_the_only_one_to_fit(clean):
