@@ -31,6 +31,7 @@ from ident.trust import (
     collapsed,
     explained_share,
     fails_held_out,
+    is_halved,
     known_probability,
     left_of,
     left_on_held_out,
@@ -41,7 +42,7 @@ from ident.trust import (
     within_steps,
 )
 from ident.units import linear_names, parameter_unit, text_at, unit_at
-from ident.verdict import LEFT_OUT, UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
+from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 AXIS_STEP = 1e-6  # of a tilt
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
@@ -94,7 +95,7 @@ def conclude(
     tones = of_their_own(tones, final)
     left = result.left_share if result.detected else 0.0
     judged = judged or gain
-    halved = judged is not None and judged.method == LEFT_OUT and len({g.operating_point for g in problem.groups}) < 3
+    halved = judged is not None and is_halved(problem, judged)
     refuted = result.unknown or fails_held_out(judged, final, left, halved) or patchwork(named_effects(final))
     unknown = result.detected and (
         refuted

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,9 +21,8 @@ from ident.conclude import (
     step_note,
 )
 from ident.dataset import Dataset
-from ident.extended import Prediction, predict
-from ident.gain import Errors, measure_gain, ratio_interval, segment_errors
-from ident.graybox import Parameters
+from ident.extended import Prediction
+from ident.gain import ratio_interval
 from ident.group import Group
 from ident.held_out import not_fitted, with_held_out
 from ident.hypotheses.sensing import torque_offset
@@ -36,7 +35,7 @@ from ident.identification import (
     with_noise_of_fast_lines,
     with_steps_of,
 )
-from ident.left_out import SEED, errors_on_parts, joined, refitted
+from ident.left_out import SEED, errors_on_parts
 from ident.leftover import find_leftover
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
@@ -44,6 +43,7 @@ from ident.next_experiment import separating_experiment
 from ident.parallel import Workers, one_thread_each
 from ident.period_checks import unrepeated
 from ident.problem import NOT_COMPUTED, Problem, predictions
+from ident.refuted import HeldOut, held_out, taken_back
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.rigid import RigidFit, carried_over, fit_rigid
 from ident.stepping import with_steps
@@ -52,8 +52,7 @@ from ident.tones import Tone, find_tones
 from ident.torque_checks import mislabelled
 from ident.torque_fit import Fit
 from ident.trust import LEFT_ERROR, denied, known_probability
-from ident.units import torque_unit, units_of_torques
-from ident.verdict import LEFT_OUT, UNKNOWN, Diagnosis, Gain, Verdict
+from ident.verdict import UNKNOWN, Diagnosis, Verdict
 from robot_assets.robot import guessed_drives
 
 # share of the discrepancy of torque and link encoders together, above which the torque is asked alone
@@ -128,20 +127,14 @@ def diagnose_fully(
     first = predictions(problem, baseline.model, baseline.remainders)
     method = "validation segments" if dataset is given else "the end of the only motion, held out"
 
-    def tested(found: Attribution) -> HeldOut:
+    def tested(found: Attribution, inertias: bool) -> HeldOut:
         affected = affected_joints(problem, baseline, first) if found.detected else ()
-        return held_out(setup, nominal, baseline, found, rigid is not None, affected, method, workers)
+        return held_out(setup, nominal, baseline, found, inertias and rigid is not None, affected, method, workers)
 
-    test = tested(result)
-    notes: list[str] = []
-    if test.gain is not None and test.judged is not None and test.judged.worse:
-        names = ", ".join(f"{e.hypothesis.effect} at {e.hypothesis.place}" for e in named_effects(result.final))
-        notes.append(
-            f"Taken back: {names or 'what has no name'}. Held-out data are predicted worse with than without: {test.gain.after:.3g} in place of"
-            f" {test.gain.before:.3g} {torque_unit(dataset.robot, test.gain.joints)}."
-        )
-        result, rigid = result.without_causes(), None
-        test = tested(result)
+    kept, test, notes = taken_back(setup, result, tested)
+    if kept is not result and not kept.rounds:
+        rigid = None
+    result = kept
     gain, judged = test.gain, test.judged
     if test.told_by_torque:
         notes.append(chosen_motion_note(test.told_by_torque))
@@ -219,58 +212,6 @@ def diagnose_fully(
             tuple((c.hypothesis.effect, c.hypothesis.place, c.probability) for c in r.candidates) for r in result.rounds
         ),
     )
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Gain on data that no model was fitted to.
-
-    Attributes:
-        judged: the same for what names are trusted by, of ``Errors.seen_along``.
-        shown, pairs: groups to be shown, and their predictions before and after.
-        told_by_torque: as of ``Errors``.
-    """
-
-    gain: Gain | None
-    judged: Gain | None
-    shown: tuple[Group, ...]
-    pairs: Sequence[tuple[Prediction, Prediction]]
-    told_by_torque: tuple[str, ...] = ()
-
-
-def held_out(
-    setup: Setup,
-    nominal: Parameters,
-    baseline: Fit,
-    result: Attribution,
-    renewed: bool,
-    affected: Sequence[int],
-    method: str,
-    workers: Workers,
-) -> HeldOut:
-    """What the extended model gains on data that it was not fitted to: held-out segments, or points left out.
-
-    Args:
-        nominal, renewed: as of ``leave_one_out``.
-        affected: joints over which errors are taken.
-        method: how segments are held out, for the verdict.
-    """
-    problem, before, after = setup.problem, baseline.model, result.final.model
-    if setup.held_out:
-        errors, pairs = segment_errors(problem, setup.held_out, before, after)
-        shown = tuple(g for g in setup.held_out if g.segments[0] in errors.segments)
-    else:
-        left_out = leave_one_out(setup, nominal, baseline, result, renewed, workers)
-        g = problem.groups[0]
-        shown, pairs = (g,), [(predict(before, g, problem.sampling), predict(after, g, problem.sampling))]
-        if left_out is None:
-            return HeldOut(None, None, shown, pairs)
-        errors, method = left_out, LEFT_OUT
-    units = units_of_torques(problem.structure.robot)
-    gain, judged = (
-        measure_gain(x, units, affected, method, np.random.default_rng(SEED)) for x in (errors, errors.seen_along())
-    )
-    return HeldOut(gain, judged, shown, pairs, errors.told_by_torque)
 
 
 def tones_of(recorded: Sequence[Group], found: Sequence[Prediction]) -> tuple[Tone, ...]:
@@ -479,40 +420,3 @@ def left_over(one: Fit, other: Fit) -> float:
     noise."""
     logs = [np.log(np.maximum(fit.costs / fit.counts, 1.0)) for fit in (one, other)]
     return float(np.exp(np.mean(logs[0] - logs[1])))
-
-
-def leave_one_out(
-    setup: Setup,
-    nominal: Parameters,
-    baseline: Fit,
-    result: Attribution,
-    renewed: bool,
-    workers: Workers = Workers(),
-) -> Errors | None:
-    """Errors on one operating point after another, both models refitted without it; None of a single one.
-
-    Args:
-        nominal: starting guesses of the drives.
-        baseline: the first model.
-        renewed: whether the inertias of the links were found too.
-    """
-    problem = setup.problem
-    # Records of one posture may differ in their periods; each motion is one of its own.
-    of = [g.operating_point if g.window is None else i for i, g in enumerate(problem.groups)]
-    points = tuple(dict.fromkeys(of))
-    if len(points) < 2:
-        return None
-
-    def without(point: str | int) -> Errors:
-        left_out, kept = (
-            tuple(g for g, name in zip(problem.groups, of, strict=True) if (name == point) is out)
-            for out in (True, False)
-        )
-        models = []
-        for start in (baseline, result.final):
-            remainders = [W for W, name in zip(start.remainders, of, strict=True) if name != point]
-            found = renewed and start is result.final
-            models.append(refitted(replace(problem, nominal=nominal), kept, start, found, remainders))
-        return segment_errors(problem, left_out, *models, alone=False)[0]
-
-    return joined(workers.map(without, points))

@@ -65,6 +65,12 @@ def pruned(problem: Problem, current: Fit) -> Fit:
     return other if other.cost - same.cost < MIN_EVIDENCE * max(1.0, same.cost / same.count) else current
 
 
+def without(problem: Problem, current: Fit, key: tuple[str, str]) -> Fit:
+    """The model without an effect, by its key, fitted to the end."""
+    kept = tuple(e for e in current.model.effects if e.hypothesis.key != key)
+    return polish(problem, replace(current, model=replace(current.model, effects=kept)))
+
+
 def gears_of_one_slope(problem: Problem, current: Fit) -> dict[tuple[str, str], tuple[int, float]]:
     """Keys of laws of gears with a middle that no record leaves, and joint and slope there, N m/rad: a spring like any
     other, of which the drives had missed the stiffness."""

@@ -24,7 +24,7 @@ from ident.quantization import Steps
 from ident.refits import settled
 from ident.rounds import MIN_EVIDENCE, Round
 from ident.torque_fit import Fit
-from ident.verdict import Gain, JointGain
+from ident.verdict import LEFT_OUT, Gain, JointGain
 from ident.weights import make_weights
 
 LEFT_NOISE = 1.15  # chi2 per degree of freedom up to which the noise floor counts as reached
@@ -94,6 +94,12 @@ def explained_share(found: Round, final: Fit) -> float:
     return fall / max(fall + left, 1e-300)
 
 
+def is_halved(problem: Problem, gain: Gain) -> bool:
+    """Whether a posture is left out of two: a model that is right is then fitted to half of what it was, and need not
+    carry over as well."""
+    return gain.method == LEFT_OUT and len({g.operating_point for g in problem.groups}) < 3
+
+
 def fails_held_out(gain: Gain | None, final: Fit, left: float, halved: bool = False) -> bool:
     """Whether held-out data refute the extended model: no name is trusted then.
 
@@ -102,8 +108,7 @@ def fails_held_out(gain: Gain | None, final: Fit, left: float, halved: bool = Fa
 
     Args:
         left: share of the discrepancy, as power, that the model leaves of the data that it was fitted to.
-        halved: whether a posture is left out of two: a model that is right is then fitted to half of what it was, and
-            need not carry over as well.
+        halved: ``is_halved``.
     """
     if gain is None:
         return False

@@ -11,7 +11,7 @@ from ident.chain import build_structure
 from ident.coordinates import pack, unpack
 from ident.costs import joint_costs
 from ident.derivatives import jacobian
-from ident.diagnosis import diagnose, leave_one_out
+from ident.diagnosis import diagnose
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.extended import predict
 from ident.frf import estimate_frf
@@ -23,6 +23,7 @@ from ident.identification import identify, set_up
 from ident.model import Effect, Model
 from ident.problem import output_error, predictions
 from ident.refits import reweighted
+from ident.refuted import leave_one_out
 from ident.screening import screen
 from ident.torque_fit import SLIGHT, fit
 from ident.weights import make_weights
