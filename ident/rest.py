@@ -4,31 +4,46 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.ndimage
+import scipy.stats
 
 from ident.group import Group
 
 REST_TIME, REST_SAMPLES = 0.01, 5  # s, and samples at least, within which a motor that stands still does not move
 REST_NOISE = 6.0  # beyond this many standard deviations of its noise
+LONGER = 4  # times the time of a short rest
+WIDER = 0.7  # standard deviations by which positions of one at rest may range further than noise does in the mean
 
 
 def at_rest(q: np.ndarray, fs: float, span: float) -> np.ndarray:
     """Where motors stand still (N, n): samples in windows of ``span`` seconds that hold no more than noise, or a step
     of the encoder."""
-    return _still(q, max(round(span * fs), REST_SAMPLES), _stillness(q, 1), "nearest")
+    return _still(q, max(round(span * fs), REST_SAMPLES), _stillness(q, REST_NOISE), "nearest")
 
 
 def at_rest_in_period(q: np.ndarray, fs: float, span: float) -> np.ndarray:
-    """The same of the mean over periods (P, N, n)."""
-    level = _stillness(q.reshape(-1, q.shape[-1]), len(q))
-    return _still(q.mean(axis=0), max(round(span * fs), REST_SAMPLES), level, "wrap")
+    """The same of the mean over periods (P, N, n): of motors that stand still for long, and most that do so for a short
+    time, where those that creep must not be taken for them; where they turn they rest too (``turning``)."""
+    mean, samples = q.mean(axis=0), q.reshape(-1, q.shape[-1])
+    width = max(round(span * fs), REST_SAMPLES)
+    short, long = (
+        _still(mean, size, _stillness(samples, apart / np.sqrt(len(q))), "wrap")
+        for size, apart in ((width, noise_range(width) + WIDER), (LONGER * width, REST_NOISE))
+    )
+    return short | long
 
 
-def _stillness(q: np.ndarray, count: int) -> np.ndarray:
-    """(n,) what means over ``count`` positions (N, n) of motors that stand still differ by, rad: noise, or a step of
-    the encoder."""
+def noise_range(count: int) -> float:
+    """Mean range of so many independent normal numbers, standard deviations: twice their mean maximum, to 1 % (Chen and
+    Tyler, Commun. Statist. Simul. Comput. 28, 1999)."""
+    return float(2.0 * scipy.stats.norm.ppf(0.5264 ** (1.0 / count)))
+
+
+def _stillness(q: np.ndarray, apart: float) -> np.ndarray:
+    """(n,) what positions (N, n) of motors that stand still differ by, rad: so many standard deviations of their noise,
+    or a step of the encoder."""
     steps = np.abs(np.diff(q, axis=0))
     least = np.min(np.where(steps > 0, steps, np.inf), axis=0)
-    return np.maximum(REST_NOISE * difference_noise(q) / np.sqrt(count), np.where(np.isfinite(least), 1.5 * least, 0.0))
+    return np.maximum(apart * difference_noise(q), np.where(np.isfinite(least), 1.5 * least, 0.0))
 
 
 def lasting(rest: np.ndarray, width: int) -> np.ndarray:

@@ -102,13 +102,23 @@ def dry(
     if largest < SEEN * motion.asked_noise(j):
         return moving
     asked, least, most = motion.asked(j), -np.abs(back), np.abs(size)
-    friction = np.where(rest, np.clip(asked, least, most), moving)
+    noise = motion.asked_noise(j)
+    friction = np.where(rest, _within(asked, least, most, noise), moving)
     # Of what is asked only some lines are known, and its jumps ring: what has these lines within the limits is sought,
     # by projection onto one and the other in turn (Papoulis 1975).
     for _ in range(PROJECTIONS):
         missing = asked - motion.group.to_time(motion.lines(friction)[..., None])[..., 0]
-        friction = np.where(rest, np.clip(friction + missing, least, most), moving)
+        friction = np.where(rest, _within(friction + missing, least, most, noise), moving)
     return friction
+
+
+def _within(asked: np.ndarray, least: np.ndarray, most: np.ndarray, noise: float) -> np.ndarray:
+    """What dry friction gives of that which is asked of it: one that is its size but for noise is that.
+
+    A motor that creeps or turns looks like one at rest, and is asked its size and noise, of which a limit at that size
+    would keep one side: the friction would be found too large for what it takes.
+    """
+    return np.where(asked > most - noise, most, np.where(asked < least + noise, least, asked))
 
 
 def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
