@@ -52,6 +52,8 @@ class Group:
         rounding: (K, n) variance of a line of the mean position by the steps of its encoder, rad2, which repeats with
             the motion and does not average out over periods; or None.
         steps: of a simulation that made the records; None of a machine.
+        alike_turn_noise: (n,) as ``turn_noise``, of all records of a dataset together: friction must not turn otherwise in
+            one posture than in another; that of the group where None.
         creeps: whether single periods end elsewhere than the one before, of a transient.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
@@ -85,6 +87,7 @@ class Group:
     Q_noise: np.ndarray | None = None
     known_noise: tuple[np.ndarray, np.ndarray] | None = None
     rounding: np.ndarray | None = None
+    alike_turn_noise: np.ndarray | None = None
     creeps: bool = False
     steps: TimeSteps | None = None
 
@@ -174,6 +177,8 @@ class Group:
     @cached_property
     def turn_noise(self) -> np.ndarray:
         """(n,) the same in the mean over records."""
+        if self.alike_turn_noise is not None:
+            return self.alike_turn_noise
         return np.sqrt(np.mean(self.velocity_error**2, axis=0))
 
     @cached_property

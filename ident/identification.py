@@ -29,7 +29,7 @@ from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps, with_rounding
 from ident.recorded_noise import declared_position_noise, given_noise, least_noise, noise_of, recorded_noise
-from ident.records import build_groups
+from ident.records import build_groups, with_turns_alike
 from ident.refits import under_own_noise
 from ident.roll_off import with_roll_off
 from ident.stepping import in_steps, shown_steps, told_by
@@ -69,12 +69,13 @@ def set_up(dataset: Dataset, *, fast: bool = False) -> Setup:
     nominal, structure = Parameters.nominal(robot), build_structure(robot)
     band = motion_band_hz(dataset, structure, nominal)
     groups = build_groups(dataset, motion_band_hz=band, fast=fast)
-    multisines = tuple(g for g in groups if g.window is None)
     held_out: tuple[Group, ...] = ()
     ran_away = runaways(dataset)
     told = replace(dataset, segments=tuple(s for s in dataset.segments if s.name not in ran_away))
     if told.select(role="validation"):
         held_out = build_groups(told, role="validation", motion_band_hz=band, fast=fast)
+    groups, held_out = with_turns_alike(groups, held_out)
+    multisines = tuple(g for g in groups if g.window is None)
     q_std, tau_std = recorded_noise(dataset)
     declared = declared_position_noise(dataset)
     steps = find_steps(dataset, declared) if np.all(declared > 0) else ()

@@ -8,7 +8,7 @@ keeps the return and the first transient out of every comparison.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +75,18 @@ def build_groups(
         else _periodic_group(dataset, members, top, began)
         for members in groups.values()
     )
+
+
+def with_turns_alike(groups: Sequence[Group], others: Sequence[Group]) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
+    """Periodic groups with one ``turn_noise`` for all of them, and others of the same dataset with that too."""
+    noise = [g.turn_noise for g in groups if g.window is None]
+    if not noise:
+        return tuple(groups), tuple(others)
+    alike = np.sqrt(np.mean(np.square(noise), axis=0))
+    one, other = (
+        tuple(replace(g, alike_turn_noise=alike) if g.window is None else g for g in some) for some in (groups, others)
+    )
+    return one, other
 
 
 def highest_line_hz(dataset: Dataset) -> float:

@@ -24,7 +24,7 @@ from ident.model import Effect, Model, along_record
 from ident.output_noise import noise_covariance
 from ident.problem import data_counts, residual
 from ident.pruning import plainly_special
-from ident.records import build_groups, without_creep
+from ident.records import build_groups, with_turns_alike, without_creep
 from ident.refits import either_turn, refit
 from ident.stiction import LEFT_HELD, as_held, held, held_share
 from ident.weights import make_weights
@@ -363,3 +363,16 @@ def test_a_friction_that_sticks_is_found_from_either_side_of_what_is_seen(begun)
     # Without motors that rest, or for another effect, there is nothing to choose.
     moving = replace(problem, groups=tuple(replace(g, rest=None) for g in problem.groups))
     assert either_turn(moving, first, first.model.effects[0]) is first
+
+
+def test_friction_turns_alike_in_all_records_of_a_dataset():
+    """One posture more or less noisy than the others, or held out, must not decide otherwise whether a turn is seen."""
+    problem, _ = friction("coulomb_friction", [COULOMB, 0.0, 1e-6, 0.0])
+    (group, *_) = problem.groups
+    noisy = replace(group, omega=2.0 * group.omega)
+    assert noisy.turn_noise[0] > 1.5 * group.turn_noise[0]
+    (one, other), (held_out,) = with_turns_alike([group, noisy], [noisy])
+    mean = np.sqrt(np.mean([group.turn_noise**2, noisy.turn_noise**2], axis=0))
+    assert all(g.turn_noise == pytest.approx(mean) for g in (one, other, held_out, one.pick(np.array([0]))))
+    along = replace(group, window=np.ones(group.n_time))
+    assert with_turns_alike([along], [group]) == ((along,), (group,))
