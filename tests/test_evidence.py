@@ -45,7 +45,7 @@ from ident.model import Effect, along_record
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
 from ident.problem import Weights, data_counts, predictions
-from ident.pruning import pruned, renamed, without_shadows
+from ident.pruning import plainly_special, pruned, renamed, without_shadows
 from ident.refits import polish, refit, reweighted, settled, to_compete, turned, under_own_noise
 from ident.reporting import frf_views, most_affected
 from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
@@ -230,6 +230,13 @@ def test_a_decoy_that_holds_a_law_steps_back_behind_it_and_is_told_of(named):
 def test_a_power_of_the_speed_at_its_bounds_is_the_friction_of_the_catalogue(named):
     rising = named["unknown:rising_friction", "elbow_joint"]
     assert [pointless(Effect(rising, np.array([1.0, e, 1e-3])), 1e4) for e in (0.2, 0.4, 0.9)] == [True, False, True]
+
+
+def test_a_friction_that_drifts_by_less_than_its_law_errs_is_coulombs(named):
+    drift = named["friction_drift", "elbow_joint"]
+    for change, absent in ((-0.007, True), (0.015, True), (-0.05, False)):
+        effect = Effect(drift, np.array([change, 300.0, 5.0, 1e-3, 0.0]))
+        assert pointless(effect, 1e4) == plainly_special(None, None, effect) == absent
 
 
 def test_a_load_has_odds_over_a_body_only_where_that_is_clearly_off():

@@ -25,6 +25,7 @@ LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
 LEAST_DIP = 1.15  # static friction over Coulomb's, below which it is as good as that
+LEAST_CHANGE = 0.02  # of a friction that drifts, below which it may as well be the error of one that does not
 MOST_DIP = 10.0  # the same, beyond which nothing rubs in motion: no friction of a bearing
 # of the velocity in the fall of a Stribeck friction
 DIP = Parameter("exponent", "1", 0.5, 2.0, log=True, nuisance=True, step=1e-2, center=2.0, spread=0.5, reported=True)
@@ -477,6 +478,8 @@ def friction_drift(joint: int, place: str, leads: bool = True) -> Hypothesis:
             "special": lambda p: np.array([p[2], 0.0, *p[3:]]),
             "essential": ("relative_change",),
             "dry": True,
+            "trivial": lambda p, k: abs(p[0]) < LEAST_CHANGE,
+            "plain": lambda p: abs(p[0]) < LEAST_CHANGE,
         },
     )
 
