@@ -161,8 +161,10 @@ def _peak(group: Group) -> np.ndarray:
 def _separation(problem: Problem, option: _Option, a: Fit, b: Fit) -> float:
     """Expected evidence, nats, for ``a`` against ``b`` refitted, and the other way round; the smaller. None at all where
     one of them cannot be computed there."""
+    pair = (replace(x, model=simulated_laws(x.model)) for x in (a, b))
     try:
-        nats = _expected(problem, option.group, *(replace(x, model=simulated_laws(x.model)) for x in (a, b)))
+        with np.errstate(invalid="ignore"):  # models that run away there separate nothing
+            nats = _expected(problem, option.group, *pair)
     except NOT_COMPUTED:
         return 0.0
     return nats if np.isfinite(nats) else 0.0

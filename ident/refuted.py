@@ -136,15 +136,14 @@ def taken_back(
             f" {torque_unit(robot, gain.joints)}."
         )
 
-    while test.judged is not None and len(named_effects(result.final)) > 1:
+    while test.judged is not None:
+        named = {e.hypothesis.key for e in named_effects(result.final)}
+        found = [h for h in (r.candidates[0].hypothesis for r in result.rounds) if h.key in named]
         halved = is_halved(problem, test.judged)
-        if not (test.judged.worse or fails_held_out(test.judged, result.final, result.left_share, halved)):
+        refuted = test.judged.worse or fails_held_out(test.judged, result.final, result.left_share, halved)
+        if not refuted or len(found) < 2:
             break
-        last = next(
-            r.candidates[0].hypothesis
-            for r in result.rounds[::-1]
-            if any(r.candidates[0].hypothesis.key == e.hypothesis.key for e in named_effects(result.final))
-        )
+        last = found[-1]
         less = replace(
             result,
             final=without(problem, result.final, last.key),

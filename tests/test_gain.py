@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident import gain
+from ident import gain, refuted
+from ident.attribute import Attribution
 from ident.conclude import along_note, chosen_motion_note
 from ident.diagnosis import diagnose
 from ident.gain import Errors, line_squares, mean_squares, measure_gain
@@ -167,3 +168,41 @@ def test_a_law_that_rattles_is_told_to_be_trusted_along_the_record():
     (note,) = along_note(simulated, along)
     assert "5 N m" in note and "2." in note
     assert along_note(simulated, simulated) == () and replace(errors, along=None).seen_along().after is errors.after
+
+
+@pytest.mark.parametrize(
+    ("left", "kept"),
+    [
+        ({3: 1.1, 2: 9.0, 1: 9.0, 0: 10.0}, 3),  # nothing is refuted
+        ({3: 7.0, 2: 1.1, 1: 9.0, 0: 10.0}, 2),
+        ({3: 7.0, 2: 5.4, 1: 1.2, 0: 10.0}, 1),
+        ({3: 7.0, 2: 6.5, 1: 1.1, 0: 10.0}, 3),  # the last alone is not to blame
+        ({3: 12.0, 2: 11.5, 1: 11.5, 0: 10.0}, 0),
+    ],
+)
+def test_causes_found_last_go_where_held_out_data_refute_them(monkeypatch, ur10, left, kept):
+    """Held-out errors are those that a model with so many causes leaves."""
+    causes = [SimpleNamespace(effect=f"e{i}", place="base", key=(f"e{i}", "base"), options={}) for i in range(3)]
+
+    def model(n):
+        effects = tuple(SimpleNamespace(hypothesis=h) for h in causes[:n])
+        return SimpleNamespace(
+            model=SimpleNamespace(effects=effects), chi2_per_dof=1.0, costs=np.ones(1), counts=np.ones(1)
+        )
+
+    def tested(found, inertias):
+        n = len(found.final.model.effects)
+        rows = (np.full((40, 1), x**2) for x in (10.0, left[n], 1.0))
+        gain = measure_gain(Errors(("s",) * 40, *rows), {"elbow_joint": "N m"}, [], "method", np.random.default_rng(0))
+        return refuted.HeldOut(gain, gain, (), ())
+
+    monkeypatch.setattr(refuted, "without", lambda problem, final, key: model(len(final.model.effects) - 1))
+    monkeypatch.setattr(Attribution, "left_share", 0.0)
+    monkeypatch.setattr(Attribution, "without_causes", lambda self: replace(self, final=model(0), rounds=()))
+    rounds = tuple(SimpleNamespace(candidates=[SimpleNamespace(hypothesis=h)]) for h in causes)
+    result = Attribution(model(0), True, True, 0.0, rounds, model(3), False)
+    setup = SimpleNamespace(problem=SimpleNamespace(structure=SimpleNamespace(robot=ur10), groups=()))
+    found, test, lines = refuted.taken_back(setup, result, tested)
+    assert len(found.rounds) == len(found.final.model.effects) == kept and test.gain.after == left[kept]
+    told = {3: [], 2: ["e2"], 1: ["e2", "e1"], 0: ["e0 at base, e1 at base, e2"]}[kept]
+    assert [line.split(": ")[1].split(" at base.")[0] for line in lines] == told
