@@ -243,7 +243,7 @@ def test_torque_of_a_neighbour_is_no_cause_of_the_catalogue(locked, tmp_path):
     assert result.verdict.discrepancy.detected and result.verdict.unexplained_verdict == UNKNOWN
     assert all(c.probability <= 0.5 for c in result.verdict.causes)
     assert result.candidates[0][0][:2] == ("unknown:crosstalk", "elbow_joint")
-    assert "0.04 times that of shoulder_lift_joint" in result.verdict.residual_description
+    assert "0.04 times the torque of shoulder_lift_joint" in result.verdict.residual_description
 
 
 @pytest.mark.slow

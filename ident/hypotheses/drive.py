@@ -234,7 +234,7 @@ def crosstalk(joint: int, place: str, other: int, beside: str) -> Hypothesis:
         lambda p, motion, j, k, U: U - p[0] * asked(motion),
         lambda scale: [()],
         lambda motion, j, k, shape: Screen((-asked(motion),), np.array),
-        "The torque of {joint} goes with {share:.4g} times that of {turned}, which it does not turn.",
+        "{share:.4g} times the torque of {turned} acts at {joint} too, or shows in the record there.",
         variable="torque",
         options={"joints": (place, beside)},
     )

@@ -116,7 +116,8 @@ def _markdown(diagnosis: Diagnosis) -> str:
         ]
     if v.gain is not None:
         g, unit = v.gain, torque_unit(diagnosis.robot, v.gain.joints)
-        interval = "" if g.ci95 is None else f" (95 % interval {g.ci95[0]:.1%} to {g.ci95[1]:.1%} of the gap closed)"
+        ends = g.ci95 if g.ci95 and g.ci95[0] != g.ci95[1] else None  # of a model that was not extended both are 0
+        interval = "" if ends is None else f" (95 % interval {ends[0]:.1%} to {ends[1]:.1%} of the gap closed)"
         rows.append(
             f"Torque error on held-out data {g.before:.3g} → {g.after:.3g} {unit}, noise {g.noise_floor:.3g} {unit}{interval}."
         )
