@@ -303,8 +303,8 @@ def along_note(gain: Gain, judged: Gain) -> tuple[str, ...]:
         return ()
     unit = gain.metric.rpartition(", ")[2]
     return (
-        f"The gear has more steady motions than the model is led to: simulated it leaves {gain.after:.3g} {unit} on held-out data, along the record"
-        f" of the torque {judged.after:.3g}. Its law is trusted by the latter.",
+        f"The gear has more steady motions than the model is led to: simulated it leaves {gain.after:.3g} {unit} of held-out data, and"
+        f" {judged.after:.3g} {unit} where the recorded torque says how the gear moved. Its law is trusted by the latter.",
     )
 
 

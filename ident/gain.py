@@ -19,6 +19,7 @@ from ident.units import common_unit
 from ident.verdict import Gain, JointGain
 
 METRIC = "RMS motor-torque prediction error"
+CLEARLY = 0.8  # of what one motion leaves of a record, that another must leave for it to be the recorded one
 STRETCHES = 8  # of a motion
 RESAMPLES = 2000
 
@@ -29,8 +30,9 @@ class Errors:
     n).
 
     ``segments``: of the rows, a motion as often as it has stretches, a single periodic record as often as it has lines.
-    ``told_by_torque``: records whose steady motion after is one that their torque told. ``along``: as ``after``, but
-    along the record where laws of the gear are nearer to that: what they are, whichever motion a loop settles in.
+    ``told_by_torque``: records whose steady motion after is one that their torque told. ``along``: as ``after`` and
+    ``noise``, but along the record where laws of the gear are clearly nearer to that: what they are, whichever motion a
+    loop settles in.
     """
 
     segments: tuple[str, ...]
@@ -38,24 +40,25 @@ class Errors:
     after: np.ndarray
     noise: np.ndarray
     told_by_torque: tuple[str, ...] = field(default=(), kw_only=True)
-    along: np.ndarray | None = field(default=None, kw_only=True)
+    along: tuple[np.ndarray, np.ndarray] | None = field(default=None, kw_only=True)
 
     def seen_along(self) -> Errors:
-        """The same with the errors after that are left along the record."""
-        return self if self.along is None else replace(self, after=self.along)
+        """The same with the errors after that are left along the record, and their noise."""
+        return self if self.along is None else replace(self, after=self.along[0], noise=self.along[1], along=None)
 
 
 @dataclass(frozen=True)
 class Told:
     """A prediction in which each record makes that of several steady motions which its torque tells.
 
-    ``records`` (S,) whether one makes another than that which was predicted. ``U`` (S, L, n): the torque along the
-    record, N m, where that is nearer.
+    ``records`` (S,): whether one makes another than that which was predicted. ``rattles`` (S,): whether it makes none to
+    which the model is led, so that a prediction ``along`` the record is clearly nearer.
     """
 
     prediction: Prediction
     records: np.ndarray
-    U: np.ndarray
+    rattles: np.ndarray
+    along: Prediction
 
 
 def in_recorded_motion(pred: Prediction) -> Told:
@@ -67,7 +70,8 @@ def in_recorded_motion(pred: Prediction) -> Told:
     """
     model, group = pred.model, pred.group
     bent = [e.hypothesis.channel == "spring" and "bends" in e.hypothesis.options for e in model.effects]
-    as_it_is = Told(pred, np.zeros(len(group.U), bool), pred.U)
+    none = np.zeros(len(group.U), bool)
+    as_it_is = Told(pred, none, none, pred)
     if group.window is not None or not any(bent):
         return as_it_is
     along = tuple(
@@ -78,7 +82,7 @@ def in_recorded_motion(pred: Prediction) -> Told:
         told = predict(replace(model, effects=along), group, pred.sampling)
         start = told.solution
         other = predict(model, group, pred.sampling, W=start.W, torques=start.torques, steps=REMAINDER_STEPS)
-        nearer, chosen = _left_of(other) < _left_of(pred), pred
+        nearer, chosen = _left_of(other) < CLEARLY * _left_of(pred), pred
         if np.any(nearer):
             a, b, here = pred.solution, other.solution, nearer[:, None, None]
             torques = Torques(
@@ -88,8 +92,8 @@ def in_recorded_motion(pred: Prediction) -> Told:
             chosen = predict(model, group, pred.sampling, W=W, torques=torques, steps=REMAINDER_STEPS)
     except NOT_COMPUTED:
         return as_it_is
-    off = _left_of(told) < _left_of(chosen)
-    return Told(chosen, nearer, np.where(off[:, None, None], told.U, chosen.U))
+    rattles = _left_of(told) < CLEARLY * _left_of(chosen)
+    return Told(chosen, nearer & ~rattles, rattles, told)
 
 
 def _left_of(pred: Prediction) -> np.ndarray:
@@ -116,7 +120,7 @@ def segment_errors(
     parts = STRETCHES if motions else 1
     by_line = alone and not motions and sum(len(group.segments) for group in groups) == 1
     names: list[str] = []
-    out: list[list[np.ndarray]] = [[], [], [], []]
+    out: list[list[np.ndarray]] = [[], [], [], [], []]
     pairs = []
     by_torque: tuple[str, ...] = ()
     for group in groups:
@@ -128,23 +132,33 @@ def segment_errors(
         b = told.prediction
         by_torque += tuple(group.segments[i] for i in np.flatnonzero(told.records))
         pairs.append((a, b))
-        S = as_held(noise_covariance(problem, group, b), held_share(b, group))
-        share = group.window_share
-        noise = share * np.einsum("kii->ki", S).real
-        errors = [group.observe(group.U - U) for U in (a.U, b.U, told.U)]
+        share, rattles = group.window_share, told.rattles[:, None, None]
+        noise = share * _noise_of_lines(problem, b)[None].repeat(len(group.segments), axis=0)
+        noise_along = noise
+        if np.any(told.rattles):
+            noise_along = np.where(rattles, share * _noise_of_lines(problem, told.along), noise)
+        errors = [group.observe(group.U - U) for U in (a.U, b.U, np.where(rattles, told.along.U, b.U))]
         if by_line:
             names += group.segments * group.n_compared
-            for store, lines in zip(out, (*(np.abs(e[0]) ** 2 for e in errors), noise), strict=True):
-                store.append(line_squares(lines))
+            for store, lines in zip(out, (*(np.abs(e) ** 2 for e in errors), noise, noise_along), strict=True):
+                store.append(line_squares(lines[0]))
             continue
         names += [name for name in group.segments for _ in range(parts)]
-        for store, e in zip(out, errors, strict=False):
+        for store, e in zip(out[:3], errors, strict=True):
             store.append((mean_squares(np.abs(e) ** 2) if parts == 1 else stretch_squares(group, e, parts)) / share)
-        out[3].append(np.repeat(mean_squares(noise[None]) / share, parts * len(group.segments), axis=0))
-    left, left_after, along, floor = (
+        for store, lines in zip(out[3:], (noise, noise_along), strict=True):
+            store.append(np.repeat(mean_squares(lines) / share, parts, axis=0))
+    left, left_after, along, floor, floor_along = (
         np.concatenate(x) if x else np.zeros((0, len(problem.nominal.stiffness))) for x in out
     )
-    return Errors(tuple(names), left, left_after, floor, told_by_torque=by_torque, along=along), pairs
+    told_along = along, floor_along
+    return Errors(tuple(names), left, left_after, floor, told_by_torque=by_torque, along=told_along), pairs
+
+
+def _noise_of_lines(problem: Problem, pred: Prediction) -> np.ndarray:
+    """Variance (K, n) of the compared lines of a prediction by noise, N2 m2."""
+    S = as_held(noise_covariance(problem, pred.group, pred), held_share(pred, pred.group))
+    return np.einsum("kii->ki", S).real
 
 
 def mean_squares(lines: np.ndarray) -> np.ndarray:

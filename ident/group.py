@@ -52,8 +52,8 @@ class Group:
         rounding: (K, n) variance of a line of the mean position by the steps of its encoder, rad2, which repeats with
             the motion and does not average out over periods; or None.
         steps: of a simulation that made the records; None of a machine.
-        alike_turn_noise: (n,) as ``turn_noise``, of all records of a dataset together: friction must not turn otherwise in
-            one posture than in another; that of the group where None.
+        alike_turn_noise: (n,) as ``turn_noise``, in the mean over the periodic groups of a dataset that models are fitted
+            to: friction must not turn otherwise in one posture than in another; that of the group where None.
         creeps: whether single periods end elsewhere than the one before, of a transient.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.

@@ -42,11 +42,12 @@ def joined(errors: Sequence[Errors]) -> Errors:
     """Errors one below the other."""
     names = tuple(name for e in errors for name in e.segments)
     by_torque = tuple(name for e in errors for name in e.told_by_torque)
-    before, after, noise, along = (
+    pairs = [(e, e.seen_along()) for e in errors]
+    before, after, noise, *along = (
         np.concatenate(rows)
-        for rows in zip(*((e.before, e.after, e.noise, e.seen_along().after) for e in errors), strict=True)
+        for rows in zip(*((e.before, e.after, e.noise, x.after, x.noise) for e, x in pairs), strict=True)
     )
-    return Errors(names, before, after, noise, told_by_torque=by_torque, along=along)
+    return Errors(names, before, after, noise, told_by_torque=by_torque, along=(along[0], along[1]))
 
 
 def errors_on_parts(problem: Problem, one: Fit, other: Fit, workers: Workers, renewed: bool = False) -> Errors:
@@ -84,7 +85,7 @@ def carries_over(problem: Problem, before: Fit, after: Fit, joint: int, workers:
         errors = errors_on_parts(problem, before, after, workers)
     except NOT_COMPUTED:
         return False
-    own = replace(errors, **{f: getattr(errors, f)[:, [joint]] for f in ("before", "after", "noise")})
+    own = replace(errors, along=None, **{f: getattr(errors, f)[:, [joint]] for f in ("before", "after", "noise")})
     return any(ratio_interval(e, np.random.default_rng(SEED), CARRIES)[1] < 1.0 for e in (own, errors))
 
 

@@ -15,7 +15,7 @@ from ident.hypotheses import Hypothesis
 from ident.model import Effect, Model, joints_along_record
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
-from ident.refits import POLISH_STEPS, clip_to_bounds, polish, refit, reweighted
+from ident.refits import POLISH_STEPS, beside_its_error, clip_to_bounds, polish, refit, reweighted
 from ident.rounds import MIN_EVIDENCE, Round
 from ident.torque_fit import Fit
 
@@ -65,10 +65,10 @@ def pruned(problem: Problem, current: Fit) -> Fit:
     return other if other.cost - same.cost < MIN_EVIDENCE * max(1.0, same.cost / same.count) else current
 
 
-def without(problem: Problem, current: Fit, key: tuple[str, str]) -> Fit:
+def without_effect(problem: Problem, current: Fit, key: tuple[str, str]) -> Fit:
     """The model without an effect, by its key, fitted to the end."""
     kept = tuple(e for e in current.model.effects if e.hypothesis.key != key)
-    return polish(problem, replace(current, model=replace(current.model, effects=kept)))
+    return beside_its_error(problem, polish(problem, replace(current, model=replace(current.model, effects=kept))))
 
 
 def gears_of_one_slope(problem: Problem, current: Fit) -> dict[tuple[str, str], tuple[int, float]]:

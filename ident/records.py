@@ -78,7 +78,7 @@ def build_groups(
 
 
 def with_turns_alike(groups: Sequence[Group], others: Sequence[Group]) -> tuple[tuple[Group, ...], tuple[Group, ...]]:
-    """Periodic groups with one ``turn_noise`` for all of them, and others of the same dataset with that too."""
+    """Periodic groups with one ``turn_noise``, the mean over all of them, and others of the same dataset with that too."""
     noise = [g.turn_noise for g in groups if g.window is None]
     if not noise:
         return tuple(groups), tuple(others)

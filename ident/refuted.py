@@ -16,7 +16,8 @@ from ident.group import Group
 from ident.identification import Setup
 from ident.left_out import SEED, joined, refitted
 from ident.parallel import Workers
-from ident.pruning import without
+from ident.problem import NOT_COMPUTED
+from ident.pruning import without_effect
 from ident.torque_fit import Fit
 from ident.trust import fails_held_out, is_halved
 from ident.units import torque_unit, units_of_torques
@@ -130,26 +131,26 @@ def taken_back(
     problem, robot = setup.problem, setup.problem.structure.robot
     test, lines = tested(result, True), []
 
-    def told(what: str, gain: Gain, without: float) -> str:
+    def told(what: str, gain: Gain, left: float) -> str:
         return (
-            f"Taken back: {what}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of {without:.3g}"
+            f"Taken back: {what}. Held-out data are predicted worse with than without: {gain.after:.3g} in place of {left:.3g}"
             f" {torque_unit(robot, gain.joints)}."
         )
 
     while test.judged is not None:
         named = {e.hypothesis.key for e in named_effects(result.final)}
-        found = [h for h in (r.candidates[0].hypothesis for r in result.rounds) if h.key in named]
+        found = list({h.key: h for h in (r.candidates[0].hypothesis for r in result.rounds) if h.key in named}.values())
         halved = is_halved(problem, test.judged)
         refuted = test.judged.worse or fails_held_out(test.judged, result.final, result.left_share, halved)
         if not refuted or len(found) < 2:
             break
         last = found[-1]
-        less = replace(
-            result,
-            final=without(problem, result.final, last.key),
-            rounds=tuple(r for r in result.rounds if r.candidates[0].hypothesis.key != last.key),
-        )
-        other = tested(less, True)
+        rounds = tuple(r for r in result.rounds if r.candidates[0].hypothesis.key != last.key)
+        try:
+            less = replace(result, final=without_effect(problem, result.final, last.key), rounds=rounds)
+            other = tested(less, True)
+        except NOT_COMPUTED:
+            break
         if other.judged is None or not other.judged.after < CARRIES * test.judged.after:
             break
         lines.append(told(f"{last.effect} at {last.place}", test.judged, other.judged.after))

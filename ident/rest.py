@@ -33,8 +33,8 @@ def at_rest_in_period(q: np.ndarray, fs: float, span: float) -> np.ndarray:
 
 
 def noise_range(count: int) -> float:
-    """Mean range of so many independent normal numbers, standard deviations: twice their mean maximum, to 1 % (Chen and
-    Tyler, Commun. Statist. Simul. Comput. 28, 1999)."""
+    """Mean range of so many independent normal numbers, standard deviations: twice their mean maximum, to 1 % from
+    5 on (Chen and Tyler, Commun. Statist. Simul. Comput. 28, 1999)."""
     return float(2.0 * scipy.stats.norm.ppf(0.5264 ** (1.0 / count)))
 
 

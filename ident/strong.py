@@ -43,7 +43,7 @@ CLEARLY_BETTER = 0.8  # excess that a model along the record leaves, over that o
 FAR_BEHIND = 1.5  # cost at its joint of a law along the record over that of the best candidate, beyond which it is out
 HARDLY_LESS = 0.9  # of what is left without a strong effect under softened weights, for that to explain anything
 UNANSWERED = 30.0  # chi2 per degree of freedom that the best may leave before laws of the gear are sought at all joints
-ANSWERED = 0.05  # share of that up to which a law of the gear answers what nothing did
+ANSWERED = 0.05  # share of what the best leaves, up to which a law of the gear answers what nothing did
 SPILT = 0.1  # share of what is left at one joint that errors of the law there leave at others
 
 
@@ -64,7 +64,7 @@ def beside_strong(
     as loops where these do as well. Those at the joint of the best candidate come first, and last where its own law
     leaves noise alone. A gear that bends turns the links of others too, and their drives with them to where any joint
     may be the loudest: where these cannot be those of the arm, and nothing answers, laws of the gear are sought at one
-    joint after the other, until one leaves noise.
+    joint after the other, until one answers.
 
     Args:
         quiet: joints at which none is sought.
@@ -108,16 +108,7 @@ def beside_strong(
         for joint in dict.fromkeys(s.hypothesis.joint for s in laws):  # that of the best score first
             at_joint = tried([s for s in laws if s.hypothesis.joint == joint])
             pairs += at_joint
-            print(
-                "XX",
-                joint,
-                left_by(at_joint),
-                left_by([*ranked]),
-                before.count,
-                [(h.effect, r.cost, r.chi2_per_dof) for h, r in at_joint],
-                flush=True,
-            )
-            if left_by(at_joint) < ANSWERED * left_by(ranked):
+            if left_by(at_joint) < ANSWERED * min(left_by(ranked), before.cost - before.count):
                 break
     strong = [(h, r) for h, r in pairs if not is_along_record(h)]
     # Noise along the record is taken large: a law that leaves as much even in that as no law, or clearly more than the

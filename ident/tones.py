@@ -1,9 +1,9 @@
 """Tones of the torque that do not repeat with the period: what shakes a joint at a frequency of its own.
 
 Such a tone is in the scatter between periods, or in what a transient one ends with beside a single steady one, where it
-would count as noise. It stands at one line and leaks to those
-next to it, where noise of samples, carried to the torque by the impedance of the arm, is smooth over lines once that
-impedance is taken off. Where the impedance itself is sharp, links that still swing from how the record began look alike.
+would count as noise. It stands at one line and leaks to those next to it, where noise of samples, carried to the torque
+by the impedance of the arm, is smooth over lines once that impedance is taken off. Where the impedance itself is sharp,
+links that still swing from how the record began look alike.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ SHARP = 2.0  # size of the impedance over that two lines away, from which links 
 
 @dataclass(frozen=True)
 class Tone:
-    """A line that stands above the scatter between periods near by.
+    """A line that stands above the noise near by.
 
     Attributes:
-        joint: where it is loudest; frequency_hz: of the line, to within one.
-        ratio: its power over that of the scatter.
+        joint: where it is loudest; frequency_hz: of the line, to within one; beside a single steady period to within a
+            few, as what a window shows.
+        ratio: its power over that of the noise.
     """
 
     joint: int
@@ -85,16 +86,17 @@ def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, flo
     assert noise is not None  # of such a group
     d, lines, dof = noise
     Z = Z[lines]
+    own = dof if group.U_periods.shape[1] > 1 else float(len(d))  # of one line, which lines next to it are like
     power = np.sum(np.abs(d) ** 2, axis=0)
     torque, position = white_levels(power[1:], Z[1:], np.full(len(power) - 1, dof))
     # What rounding leaves of records without noise is none, and holds no tone.
     torque = torque + ROUNDED**2 * np.mean(np.sum(2.0 * np.abs(group.U) ** 2, axis=1), axis=0)
     root = np.linalg.cholesky(white_covariance(Z, torque, position))
     white = np.sum(np.abs(np.linalg.solve(root[None], d[..., None])[..., 0]) ** 2, axis=0)
-    middle = scipy.stats.gamma.median(dof) / dof  # of the power of lines of noise, over its mean
+    middle = scipy.stats.gamma.median(own) / own  # of the power of lines of noise, over its mean
     padded = np.pad(white[1:], ((REACH, REACH), (0, 0)), constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * REACH + 1, axis=0)
     near = np.delete(around, np.arange(REACH - NEXT, REACH + NEXT + 1), axis=-1)
     ratio = np.ones_like(white)
     ratio[1:] = white[1:] * middle / np.maximum(np.nanmedian(near, axis=-1), QUIETEST)
-    return ratio, lines, dof
+    return ratio, lines, own

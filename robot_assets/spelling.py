@@ -1,4 +1,4 @@
-"""The drives and loads of a ``robot.toml`` in the ways in which people write them down: each as a table of its own.
+"""The drives, loads and limits of a ``robot.toml`` in the ways in which people write them down: a table for each.
 
 ``[[joint]]`` and ``[[load]]`` are the way of this project. What else says the same without doubt is read too: another
 name of the array, one table where there is one, a table of each joint by its name, lists in the order of the joints, or
@@ -25,10 +25,11 @@ OTHER_NAMES = {
     "q_std": ("q_noise_std",),
     "tau_std": ("tau_noise_std",),
 }
-# Tables of figures for all joints or a list of one for each, by the names that these have there.
-OF_ALL = {
-    "noise": {"q_std": "q_std", "tau_std": "tau_std"},
-    "limits": {"effort": "torque_limit", "torque": "torque_limit", "velocity": "velocity_limit"},
+# Tables with a figure for all joints, or a list of one for each; and names beside those of ``names_of`` that only they
+# have.
+OF_ALL: dict[str, dict[str, tuple[str, ...]]] = {
+    "noise": {"q_std": (), "tau_std": ()},
+    "limits": {"torque_limit": ("effort", "torque"), "velocity_limit": ("velocity",)},
 }
 
 
@@ -123,13 +124,16 @@ def _of_lists(lists: dict[str, Any], names: list[str], where: str) -> list[dict[
 
 
 def _with_figures(
-    entries: list[dict[str, Any]], table: str, given: dict[str, Any], figures: dict[str, str], where: str
+    entries: list[dict[str, Any]], table: str, given: dict[str, Any], figures: dict[str, tuple[str, ...]], where: str
 ) -> list[dict[str, Any]]:
     """Figures of a table for all joints, as ``[noise]`` of a dataset, given to those that have none of their own."""
-    for key, figure in figures.items():
-        if key not in given:
+    for figure, others in figures.items():
+        used = [key for key in (*names_of(figure), *others) if key in given]
+        if not used:
             continue
-        values = given[key]
+        if len(used) > 1:
+            raise DataError(f"[{table}] {used[1]}", where, f"{used[0]} beside it", "one of the two: they are the same")
+        key, values = used[0], given[used[0]]
         if not isinstance(values, list):
             values = [values] * len(entries)
         if len(values) != len(entries):

@@ -151,22 +151,26 @@ def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(mon
 
     monkeypatch.setattr(gain, "predict", predict)
     told = gain.in_recorded_motion(predicted(model, [0.2, 7.0]))
-    assert told.records.tolist() == [False, True] and "in second," in chosen_motion_note(["second"])
+    assert told.records.tolist() == [False, not rattles] and "in second," in chosen_motion_note(["second"])
+    assert told.rattles.tolist() == [False, rattles]
     assert told.prediction.U[:, 0, 0].real == pytest.approx(left)
-    assert told.U[:, 0, 0].real == pytest.approx(left_along)
+    seen = np.where(told.rattles[:, None, None], told.along.U, told.prediction.U)
+    assert seen[:, 0, 0].real == pytest.approx(left_along)
     linear = replace(model, effects=())
     start = predicted(linear, [0.2, 7.0])
     assert gain.in_recorded_motion(start).prediction is start
 
 
 def test_a_law_that_rattles_is_told_to_be_trusted_along_the_record():
-    errors = Errors(("one", "two"), *(np.full((2, 1), x) for x in (100.0, 25.0, 1.0)), along=np.full((2, 1), 4.0))
+    errors = Errors(
+        ("one", "two"), *(np.full((2, 1), x) for x in (100.0, 25.0, 1.0)), along=(np.full((2, 1), 4.0), np.ones((2, 1)))
+    )
     simulated, along = (
         measure_gain(x, {"drive": "N m"}, [], "method", np.random.default_rng(0)) for x in (errors, errors.seen_along())
     )
     assert (simulated.after, along.after) == (5.0, 2.0) and simulated.gap_closed < 0.6 < along.gap_closed
     (note,) = along_note(simulated, along)
-    assert "5 N m" in note and "2." in note
+    assert "leaves 5 N m" in note and "and 2 N m" in note
     assert along_note(simulated, simulated) == () and replace(errors, along=None).seen_along().after is errors.after
 
 
@@ -196,7 +200,7 @@ def test_causes_found_last_go_where_held_out_data_refute_them(monkeypatch, ur10,
         gain = measure_gain(Errors(("s",) * 40, *rows), {"elbow_joint": "N m"}, [], "method", np.random.default_rng(0))
         return refuted.HeldOut(gain, gain, (), ())
 
-    monkeypatch.setattr(refuted, "without", lambda problem, final, key: model(len(final.model.effects) - 1))
+    monkeypatch.setattr(refuted, "without_effect", lambda problem, final, key: model(len(final.model.effects) - 1))
     monkeypatch.setattr(Attribution, "left_share", 0.0)
     monkeypatch.setattr(Attribution, "without_causes", lambda self: replace(self, final=model(0), rounds=()))
     rounds = tuple(SimpleNamespace(candidates=[SimpleNamespace(hypothesis=h)]) for h in causes)

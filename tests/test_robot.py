@@ -167,6 +167,7 @@ def test_limits_for_all_joints_give_way_to_those_of_one(tmp_path):
         ("joint = 3", "3"),
         (f"{DRIVES}[load]\n{LOAD}[[loads]]\n{LOAD}", "[[load]] beside it"),
         (f"{DRIVES}[limits]\neffort = [1.0]", "[1.0]"),
+        (f"{DRIVES}[limits]\neffort = 1.0\ntorque_max = 1.0", "torque_max beside it"),
         (f'{LISTED}[[drive]]\njoint = "shoulder"\n{EACH[0]}', "drives of ['shoulder']"),
         (LISTED + f'[[drive]]\njoint = "elbow"\n{EACH[0]}' * 2, "drives of ['elbow', 'elbow']"),
         (f"{LISTED}[[drive]]\n{EACH[0]}[[joint]]\n{EACH[1]}", "[[joint]] beside it"),

@@ -19,6 +19,7 @@ from ident.diagnosis import diagnose
 from ident.extended import predict
 from ident.group import Group
 from ident.hypotheses import catalogue
+from ident.hypotheses.friction import within
 from ident.identification import set_up
 from ident.model import Effect, Model, along_record
 from ident.output_noise import noise_covariance
@@ -376,3 +377,18 @@ def test_friction_turns_alike_in_all_records_of_a_dataset():
     assert all(g.turn_noise == pytest.approx(mean) for g in (one, other, held_out, one.pick(np.array([0]))))
     along = replace(group, window=np.ones(group.n_time))
     assert with_turns_alike([along], [group]) == ((along,), (group,))
+
+
+def test_what_is_asked_of_a_friction_at_its_size_loses_little_of_one_side_of_its_noise():
+    """In the mean over noise, where a limit alone would take 0.4 of its standard deviation; without jumps, and between the
+    limits where these are within the noise."""
+    noise = np.random.default_rng(0).normal(size=200_000)
+    given = within(3.0 + 0.1 * noise, np.full(noise.shape, -3.0), np.full(noise.shape, 3.0), 0.1)
+    assert given.max() == 3.0 and given.mean() - 3.0 > -0.25 * 0.1
+    asked = np.linspace(-4.0, 4.0, 8001)
+    limits = np.full(asked.shape, -2.0), np.full(asked.shape, 3.0)
+    given = within(asked, *limits, 0.1)
+    assert np.diff(given).max() < 2.5 * (asked[1] - asked[0]) and np.all(np.diff(given) >= 0.0)
+    assert np.array_equal(given[np.abs(asked) < 1.5], asked[np.abs(asked) < 1.5])
+    small = within(asked, np.full(asked.shape, -0.2), np.full(asked.shape, 0.2), 1.0)
+    assert small.min() == -0.2 and small.max() == 0.2 and np.all(small * asked >= 0.0)

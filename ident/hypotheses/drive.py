@@ -216,10 +216,10 @@ def torque_curve(joint: int, place: str) -> Hypothesis:
 
 
 def crosstalk(joint: int, place: str, other: int, beside: str) -> Hypothesis:
-    """Decoy: motor ``joint`` delivers a share of what motor ``other``, at ``beside``, is asked for too; or the record of
-    its torque shows that share of the other's, as currents that are measured side by side do.
+    """Decoy: the record of the torque of motor ``joint`` lacks ``share`` of that of motor ``other``, at ``beside``, which
+    acts there too; or shows as much with the other sign, as currents that are measured side by side do.
 
-    A coupling of the gears turns the other joint as well.
+    A coupling of the gears turns a joint as well.
     """
 
     def asked(motion: Recorded) -> np.ndarray:
@@ -234,7 +234,7 @@ def crosstalk(joint: int, place: str, other: int, beside: str) -> Hypothesis:
         lambda p, motion, j, k, U: U - p[0] * asked(motion),
         lambda scale: [()],
         lambda motion, j, k, shape: Screen((-asked(motion),), np.array),
-        "{share:.4g} times the torque of {turned} acts at {joint} too, or shows in the record there.",
+        "{share:.4g} times the torque of {turned} acts at {joint} too, or shows in the record there with the other sign.",
         variable="torque",
         options={"joints": (place, beside)},
     )

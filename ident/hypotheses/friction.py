@@ -35,6 +35,7 @@ RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
 GIVES = 3e-4, 3e-3, 3e-2  # of a bristle before it slips, at first, over the rms motion
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
+NEAR = 1.5  # standard deviations of what is asked, within which it may as well be the size of a friction
 PROJECTIONS = 2  # of what is asked at rest, onto what dry friction can be
 # of a bristle
 RELAXATION = Parameter("relaxation", "s", 0.0, 1.0, nuisance=True, center=0.0, spread=0.01, null=0.0, reported=True)
@@ -104,22 +105,25 @@ def dry(
         return moving
     asked, least, most = motion.asked(j), -np.abs(back), np.abs(size)
     noise = motion.asked_noise(j)
-    friction = np.where(rest, _within(asked, least, most, noise), moving)
+    friction = np.where(rest, within(asked, least, most, noise), moving)
     # Of what is asked only some lines are known, and its jumps ring: what has these lines within the limits is sought,
     # by projection onto one and the other in turn (Papoulis 1975).
     for _ in range(PROJECTIONS):
         missing = asked - motion.group.to_time(motion.lines(friction)[..., None])[..., 0]
-        friction = np.where(rest, _within(friction + missing, least, most, noise), moving)
+        friction = np.where(rest, within(friction + missing, least, most, noise), moving)
     return friction
 
 
-def _within(asked: np.ndarray, least: np.ndarray, most: np.ndarray, noise: float) -> np.ndarray:
-    """What dry friction gives of that which is asked of it: one that is its size but for noise is that.
+def within(asked: np.ndarray, least: np.ndarray, most: np.ndarray, noise: float) -> np.ndarray:
+    """What dry friction gives of that which is asked of it: one that is its size but for noise is nearly that.
 
     A motor that creeps or turns looks like one at rest, and is asked its size and noise, of which a limit at that size
-    would keep one side: the friction would be found too large for what it takes.
+    keeps one side: the friction would be found too large for what it takes. Where it is ``NEAR`` standard
+    deviations from the limit or less up to one is added, which takes away two fifths of that and leaves no jump.
     """
-    return np.where(asked > most - noise, most, np.where(asked < least + noise, least, asked))
+    noise = np.minimum(noise, 0.25 * (most - least))
+    more, less = (np.clip(x, 0.0, noise) for x in (asked - most + NEAR * noise, least + NEAR * noise - asked))
+    return np.clip(asked + more - less, least, most)
 
 
 def sense(motion: Motion, j: int, smoothing: float) -> np.ndarray:
@@ -429,6 +433,9 @@ def friction_drift(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """
     lead, none = sought(LEAD, leads)
 
+    def steady(p: np.ndarray) -> bool:
+        return bool(abs(p[0]) < LEAST_CHANGE)
+
     def warming(motion: Motion, j: int, tau: float) -> tuple[np.ndarray, np.ndarray]:
         return motion.par.viscous[j] * motion.v(j), warmth(motion, tau)
 
@@ -478,8 +485,8 @@ def friction_drift(joint: int, place: str, leads: bool = True) -> Hypothesis:
             "special": lambda p: np.array([p[2], 0.0, *p[3:]]),
             "essential": ("relative_change",),
             "dry": True,
-            "trivial": lambda p, k: abs(p[0]) < LEAST_CHANGE,
-            "plain": lambda p: abs(p[0]) < LEAST_CHANGE,
+            "trivial": lambda p, k: steady(p),
+            "plain": steady,
         },
     )
 
