@@ -35,7 +35,6 @@ RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
 GIVES = 3e-4, 3e-3, 3e-2  # of a bristle before it slips, at first, over the rms motion
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
-NEAR = 1.5  # standard deviations of what is asked, within which it may as well be the size of a friction
 PROJECTIONS = 2  # of what is asked at rest, onto what dry friction can be
 # of a bristle
 RELAXATION = Parameter("relaxation", "s", 0.0, 1.0, nuisance=True, center=0.0, spread=0.01, null=0.0, reported=True)
@@ -118,11 +117,12 @@ def within(asked: np.ndarray, least: np.ndarray, most: np.ndarray, noise: float)
     """What dry friction gives of that which is asked of it: one that is its size but for noise is nearly that.
 
     A motor that creeps or turns looks like one at rest, and is asked its size and noise, of which a limit at that size
-    keeps one side: the friction would be found too large for what it takes. Where it is ``NEAR`` standard
-    deviations from the limit or less up to one is added, which takes away two fifths of that and leaves no jump.
+    keeps one side: the friction would be found too large for what it takes. Within one standard deviation of the limit
+    up to as much is added, which takes away a fifth of that and leaves no jump. More would ask too much of a soft
+    constraint, which creeps at less than its size.
     """
     noise = np.minimum(noise, 0.25 * (most - least))
-    more, less = (np.clip(x, 0.0, noise) for x in (asked - most + NEAR * noise, least + NEAR * noise - asked))
+    more, less = (np.clip(x, 0.0, noise) for x in (asked - most + noise, least + noise - asked))
     return np.clip(asked + more - less, least, most)
 
 
