@@ -235,7 +235,11 @@ def answered(task: Task, search: Search, question: Question) -> tuple[Round, ...
     bare = np.inf if search.rounds or faint else worth_a_hinge(current)
     least = 0.0 if faint else worth_a_refit(current)
     quiet = frozenset() if faint else shadows(problem, current, search.rounds)
-    found = attribute_once(problem, current, question.hypotheses, workers, least, bare, quiet)
+    asked, left_at = question.hypotheses, np.flatnonzero(current.costs > DETECTION_EXCESS * current.counts)
+    if quiet and quiet.issuperset(left_at.tolist()):
+        # What the laws of causes lack is no hinge, and there are many of these.
+        asked = tuple(h for h in asked if "hinge" not in h.options)
+    found = attribute_once(problem, current, asked, workers, least, bare, quiet)
     if not answers(found) and current.chi2_per_dof > HOPELESS and not workers.late:
         found = beside_unclear(problem, current, found, question.hypotheses, workers, bare)
     if answers(found, SEEN if faint else MIN_EVIDENCE):
