@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.conclude import baseline_values, reported_parameters
 from ident.dataset import Dataset
 from ident.excitation import operating_points
 from ident.gain import measure_gain, segment_errors
@@ -25,6 +24,7 @@ from ident.show.export import NATIVE, build_mjcf, note_record
 from ident.show.simulated_gain import export_baseline, simulated_errors, spread
 from ident.torque_fit import Fit, fit
 from ident.units import units_of_torques
+from ident.values import baseline_values, reported_parameters
 from ident.verdict import Cause, Gain
 from robot_assets.robot import Robot, load_robot
 from sim import draw_effect, run_experiment

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from ident.chain import build_structure
-from ident.conclude import baseline_values
 from ident.dataset import Dataset
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.frf import estimate_frf
@@ -19,6 +18,7 @@ from ident.graybox import Parameters
 from ident.identification import identify
 from ident.outputs import outputs_into
 from ident.units import linear_names, parameter_unit
+from ident.values import baseline_values
 from robot_assets.errors import DataError
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.attribute import Attribution
-from ident.conclude import named_effects
 from ident.extended import Prediction, predict
 from ident.gain import Errors, measure_gain, segment_errors
 from ident.graybox import Parameters
@@ -21,6 +20,7 @@ from ident.pruning import without_effect
 from ident.torque_fit import Fit
 from ident.trust import fails_held_out, is_halved
 from ident.units import torque_unit, units_of_torques
+from ident.values import named_effects
 from ident.verdict import LEFT_OUT, Gain
 
 CARRIES = 0.8  # of the held-out error, that is left without a cause which does not carry over

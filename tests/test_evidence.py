@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, less_errors_of_laws
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
-from ident.conclude import _cause, _drifting_friction, conclude, faint_note, held_out_note
+from ident.conclude import Findings, _cause, _drifting_friction, conclude
 from ident.contests import alike, best_of_each, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
 from ident.derivatives import jacobian
-from ident.diagnosis import diagnose, left_over
+from ident.diagnosis import diagnose
 from ident.evidence import (
     ABSENT,
     LAW_ERROR,
@@ -42,6 +42,7 @@ from ident.hypotheses.structure import apply_change
 from ident.identification import identify
 from ident.inverse import REMAINDER_STEPS, STALL_STEPS, STALL_STEPS_OF_LAWS, plane_at, solve, stalled
 from ident.model import Effect, along_record
+from ident.notes import faint_note, held_out_note
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
 from ident.problem import Weights, data_counts, predictions
@@ -51,6 +52,7 @@ from ident.reporting import frf_views, most_affected
 from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
 from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
 from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, choose, explore, other_bodies
+from ident.seek import left_over
 from ident.strong import OTHER_MOTION, beside_strong, loudest_joint, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
 from ident.trust import fails_held_out, left_on_held_out, patchwork, shadowed, shown
@@ -705,7 +707,7 @@ def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():
     ],
 )
 def test_the_sentence_tells_what_is_sure_what_is_not_and_what_nothing_explains(causes, unknown, told):
-    from ident.conclude import sentence
+    from ident.notes import sentence
     from ident.verdict import Alternative, Cause
 
     found = [Cause(e, "a", {}, p, "", (Alternative("torque_lag", "b", rival),)) for e, p, rival in causes]
@@ -724,7 +726,7 @@ def test_the_sentence_tells_what_is_sure_what_is_not_and_what_nothing_explains(c
     ],
 )
 def test_the_sentence_lists_several_causes(names, told):
-    from ident.conclude import sentence
+    from ident.notes import sentence
     from ident.verdict import Cause
 
     said = sentence([Cause(e, "a", {}, 0.99, "", ()) for e in names], False, True, SimpleNamespace(gap_closed=0.9))
@@ -1209,7 +1211,7 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     problem = setup.problem
     preds = predictions(problem, result.model, result.remainders)
     quiet = Attribution(result, False, False, 1e-14, (), result, False)
-    assert any("p = 1e-14" in note for note in conclude(data, problem, (), result, quiet, None, preds, preds).notes)
+    assert any("p = 1e-14" in note for note in conclude(Findings(data, setup, result, quiet, preds, preds)).notes)
     h = named["hysteresis", "elbow_joint"]
     final = refit(
         problem,
@@ -1223,11 +1225,11 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     given = []
     for there in (True, False):
         monkeypatch.setattr("ident.conclude.shown", lambda *args, there=there: there)
-        (cause,) = conclude(data, problem, (), worse, heard, None, preds, preds).causes
+        (cause,) = conclude(Findings(data, setup, worse, heard, preds, preds)).causes
         given.append(cause.probability)
     assert given[0] > 0.9 and given[1] < 0.5
     monkeypatch.setattr("ident.conclude.shown", lambda *args: True)
-    verdict = conclude(data, problem, (), worse, heard, None, preds, preds, belied={h.key})
+    verdict = conclude(Findings(data, setup, worse, heard, preds, preds, belied={h.key}))
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
     assert any("hysteresis at elbow_joint" in note and "held out" in note for note in verdict.notes)
 

@@ -10,18 +10,19 @@ from scipy.signal import lfilter
 
 from ident.attribute import LEFT_TO_DECOYS, Attribution, attribute
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
-from ident.conclude import drift_note
-from ident.diagnosis import diagnose, explained
+from ident.diagnosis import diagnose
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
 from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, by_noise_alone, faint_scores, hidden, in_signal, left_by_laws, seen
 from ident.hypotheses import catalogue
 from ident.model import Effect, along_record, as_loop
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
+from ident.notes import drift_note
 from ident.problem import predictions
 from ident.refits import refit
 from ident.rounds import Round, temper_of, told_share, weighed_round
 from ident.screening import Score
 from ident.search import hopeful
+from ident.seek import explained
 from ident.trust import denied
 from ident.verdict import UNKNOWN
 from sim import parse_effect
@@ -375,7 +376,7 @@ def test_a_diagnosis_asks_held_out_data_about_its_causes(clean, identified, hypo
 
     monkeypatch.setattr("ident.diagnosis.identify", lambda *args, **rest: (setup, baseline))
     monkeypatch.setattr(
-        "ident.diagnosis.attribute",
+        "ident.seek.attribute",
         lambda *args, **rest: Attribution(baseline, True, True, 0.0, (found,), final, False),
     )
     monkeypatch.setattr("ident.diagnosis.denied", deny)

@@ -8,11 +8,11 @@ import pytest
 
 from ident import gain, refuted
 from ident.attribute import Attribution
-from ident.conclude import along_note, chosen_motion_note
 from ident.diagnosis import diagnose
 from ident.gain import Errors, line_squares, mean_squares, measure_gain
 from ident.model import Effect, Model
 from ident.motion import Torques
+from ident.notes import along_note, chosen_motion_note
 from ident.verdict import UNKNOWN
 from sim import parse_effect
 from tests.conftest import quick_experiment, small_plan, through_files

@@ -9,13 +9,14 @@ import pytest
 from ident.conclude import _late
 from ident.coordinates import pack, unpack
 from ident.derivatives import jacobian
-from ident.diagnosis import by_link_encoders, diagnose, diagnose_fully
+from ident.diagnosis import diagnose, diagnose_fully
 from ident.hypotheses import catalogue
 from ident.identification import set_up
 from ident.link_sensor import LinkDelay, comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect, Model
 from ident.parallel import Workers
 from ident.problem import data_count, data_counts, predictions
+from ident.seek import by_link_encoders
 from ident.weights import make_weights
 from sim.effects import parse_effect
 from sim.experiment import draw_drives
@@ -84,10 +85,11 @@ def test_torque_and_links_are_weighed_under_the_noise_that_the_torque_has_shown(
         sampling=replace(setup.problem.sampling, roll_off=1e-7),
     )
     first = SimpleNamespace(model=Model(told.structure, told.nominal), remainders=[None] * len(told.groups))
-    monkeypatch.setattr("ident.diagnosis.fit_baseline", lambda problem, say: None)
-    monkeypatch.setattr("ident.diagnosis.attribute", lambda problem, both, **how: problem)
-    wide, _, _, asked = by_link_encoders(still, replace(setup, problem=told), first, 1, Workers())
-    assert asked is wide.problem and asked.sampling == told.sampling and asked.groups[0].links
+    monkeypatch.setattr("ident.seek.fit_baseline", lambda problem, say: None)
+    monkeypatch.setattr("ident.seek.attribute", lambda problem, both, **how: problem)
+    both = by_link_encoders(still, replace(setup, problem=told), first, 1, Workers())
+    asked = both.result
+    assert asked is both.setup.problem and asked.sampling == told.sampling and asked.groups[0].links
     assert np.array_equal(asked.q_std, told.q_std) and np.array_equal(asked.tau_std, told.tau_std)
 
 

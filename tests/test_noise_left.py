@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 from ident.baseline import fit_baseline
-from ident.diagnosis import diagnose, sought
+from ident.diagnosis import diagnose
 from ident.identification import (
     identify,
     set_up,
@@ -21,6 +21,7 @@ from ident.noise import DOUBT, alike_at_all_lines, torque_noise_left
 from ident.parallel import Workers
 from ident.problem import predictions
 from ident.refits import reweighted
+from ident.seek import sought
 from ident.weights import make_weights
 from sim import parse_effect
 from tests.conftest import quick_experiment, small_plan, through_files

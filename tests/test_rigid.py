@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ident.attribute import Attribution, attribute
 from ident.chain import LinkChange, build_structure
 from ident.dataset import Dataset, Segment
-from ident.diagnosis import diagnose_fully, foretold, unresolved, with_inertias, worth_it
+from ident.diagnosis import diagnose_fully
 from ident.extended import predict
 from ident.graybox import Parameters
 from ident.held_out import with_held_out
@@ -28,6 +28,7 @@ from ident.pruning import plainer
 from ident.recursion import chain_of
 from ident.rigid import _from_pseudo, _inertias, _pseudo, _root, carried_over, fit_rigid, regressor
 from ident.rounds import left_share
+from ident.seek import Sought, foretold, unresolved, with_inertias, worth_it
 from ident.torque_fit import fit
 from ident.trust import too_fast
 from robot_assets.robot import Elasticity, load_robot
@@ -212,9 +213,10 @@ def test_inertias_that_do_worse_than_the_description_are_left_at_once(moved, mon
     found = Attribution(first, True, True, 0.0, (), first, True)
     worse = replace(first, costs=left * first.costs)
     asked = []
-    monkeypatch.setattr("ident.diagnosis.fit_baseline", lambda *args: worse)
-    monkeypatch.setattr("ident.diagnosis.attribute", lambda *args, **kwargs: asked.append(args[1]) or found)
-    assert with_inertias(setup, found, 1, Workers()) == (setup, found, None)
+    monkeypatch.setattr("ident.seek.fit_baseline", lambda *args: worse)
+    monkeypatch.setattr("ident.seek.attribute", lambda *args, **kwargs: asked.append(args[1]) or found)
+    before = Sought(setup, setup.problem.groups, first, found, setup.problem.nominal)
+    assert with_inertias(before, 1, Workers()) == before
     assert asked == [worse] * sought
 
 
@@ -268,7 +270,7 @@ def test_a_long_search_leaves_time_for_one_beside_inertias_found(moved, monkeypa
         ends.append(workers.deadline - began)
         return attribute(*args, workers=workers, **kwargs)
 
-    monkeypatch.setattr("ident.diagnosis.attribute", spied)
+    monkeypatch.setattr("ident.seek.attribute", spied)
     began = time.monotonic()
     diagnose_fully(moved, max_causes=0, max_seconds=1000.0)
     assert ends == [pytest.approx(500.0, abs=20.0), pytest.approx(1000.0, abs=1.0)]

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.diagnosis import beside_steady_records
 from ident.identification import identify
 from ident.parallel import Workers
 from ident.plan import make_plan
 from ident.problem import predictions
+from ident.seek import beside_steady_records
 from ident.swings import by_ends, without_swings
 from robot_assets.robot import load_robot
 from sim import run_experiment
@@ -72,10 +72,10 @@ def test_records_are_taken_without_swings_beside_causes_that_bring_the_model_nea
     """And not where next to nothing is left, or where the first model was as near."""
     baseline, final = (SimpleNamespace(chi2_per_dof=x) for x in (first, left))
     asked = []
-    monkeypatch.setattr("ident.diagnosis.swings", lambda problem, fit: fit.chi2_per_dof < 3.0)
-    monkeypatch.setattr("ident.diagnosis.without_swings", lambda problem, fit: f"{problem} without {fit.chi2_per_dof}")
-    monkeypatch.setattr("ident.diagnosis.renewed", lambda problem, fit: fit)
-    monkeypatch.setattr("ident.diagnosis.attribute", lambda problem, fit, known, **rest: asked.append(problem) or known)
+    monkeypatch.setattr("ident.seek.swings", lambda problem, fit: fit.chi2_per_dof < 3.0)
+    monkeypatch.setattr("ident.seek.without_swings", lambda problem, fit: f"{problem} without {fit.chi2_per_dof}")
+    monkeypatch.setattr("ident.seek.renewed", lambda problem, fit: fit)
+    monkeypatch.setattr("ident.seek.attribute", lambda problem, fit, known, **rest: asked.append(problem) or known)
     result = SimpleNamespace(rounds=["a cause"], final=final)
     setup, *_ = beside_steady_records(Stage("records"), baseline, result, 4, Workers())
     assert asked == (["records without 2.0"] if again else [])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ident.chain import build_structure
-from ident.conclude import at_linear_joint, told, waves
 from ident.hypotheses import catalogue
 from ident.model import Effect
+from ident.notes import told, waves
 from ident.units import (
     KIND_UNITS,
     linear_names,
@@ -18,6 +18,7 @@ from ident.units import (
     unit_at,
     unit_suffix,
 )
+from ident.values import at_linear_joint
 from robot_assets.robot import load_robot
 
 

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 
 from ident.dataset import Dataset
-from ident.diagnosis import SEED
 from ident.extended import predict
 from ident.gain import Errors, mean_squares, measure_gain
 from ident.graybox import parameter_names
@@ -17,6 +16,7 @@ from ident.group import Group
 from ident.held_out import with_held_out
 from ident.identification import identify
 from ident.inverse import Sampling
+from ident.left_out import SEED
 from ident.model import Model
 from ident.output_noise import noise_covariance
 from ident.parallel import one_thread_each

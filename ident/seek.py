@@ -1,0 +1,274 @@
+"""The search for causes as a whole: in torque or link encoders, under the noise, the steps in time and the inertias
+that show on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.attribute import Attribution, attribute
+from ident.baseline import DETECTION_EXCESS, fit_baseline, renewed
+from ident.dataset import Dataset
+from ident.gain import ratio_interval
+from ident.graybox import Parameters
+from ident.group import Group
+from ident.hypotheses.sensing import torque_offset
+from ident.identification import (
+    Setup,
+    set_up,
+    under_noise_beside_causes,
+    with_noise_of_fast_lines,
+    with_steps_of,
+)
+from ident.left_out import SEED, errors_on_parts
+from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
+from ident.model import Effect
+from ident.parallel import Workers
+from ident.problem import NOT_COMPUTED, Problem, predictions
+from ident.rigid import RigidFit, carried_over, fit_rigid
+from ident.stepping import with_steps
+from ident.swings import swings, without_swings
+from ident.torque_fit import Fit
+from ident.trust import LEFT_ERROR
+
+# share of the discrepancy of torque and link encoders together, above which the torque is asked alone
+LEFT_BY_BOTH = 0.1
+# chi2 with the links' inertias found, over that without, that is worth them by itself; geometric mean over joints
+SETTLED_BY_INERTIAS = 0.7
+# squares of the torque left with inertias found, over those with inertias described, on parts left out, that are worth
+# them
+CARRIED_OVER = 0.9
+LEFT_TO_LINKS = 1e-3  # share of the discrepancy up to which errors of the laws of causes, not links, are what is left
+TOWARDS = 0.68  # level of the interval that says so: neither choice is the safe one
+
+
+@dataclass(frozen=True)
+class Sought:
+    """What a search for causes ended with.
+
+    Attributes:
+        recorded: fitted groups as they were recorded.
+        baseline: the first model.
+        nominal: starting guesses of the drives, of links as they are described.
+        rigid: inertias of the links where they were found too.
+        late: whether the time for it was used up.
+    """
+
+    setup: Setup
+    recorded: tuple[Group, ...]
+    baseline: Fit
+    result: Attribution
+    nominal: Parameters
+    rigid: RigidFit | None = None
+    late: bool = False
+
+
+def seek(
+    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers, mislabelled: bool = False
+) -> Sought:
+    """Causes of what the baseline leaves: in link encoders and torque together where those explain both, in the torque
+    alone otherwise, and with inertias of the links where motions ask for them.
+
+    Args:
+        max_causes: rounds of attribution at most.
+        mislabelled: whether the recording is, so that neither link encoders nor inertias are asked.
+    """
+    recorded = setup.problem.groups
+    linked = None if mislabelled else by_link_encoders(dataset, setup, baseline, max_causes, workers)
+    if linked is not None and explained(linked.result):
+        return linked
+    foretell = not mislabelled and setup.problem.motions_alone and inertias_foretell(setup)
+    first_search = workers.for_half() if foretell else workers  # causes are then sought beside these inertias too
+    setup, baseline, result = sought(dataset, setup, baseline, max_causes, first_search)
+    if linked is not None and linked.result.detected and not result.detected:
+        return replace(linked, late=first_search.late)
+    found = Sought(setup, recorded, baseline, result, setup.problem.nominal, late=first_search.late)
+    if foretell and unresolved(result) and not workers.late:
+        return with_inertias(found, max_causes, workers)
+    return found
+
+
+def sought(
+    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
+) -> tuple[Setup, Fit, Attribution]:
+    """Causes of what the baseline leaves; once more where beside these the noise turns out to be far more or far less
+    than was guessed, or that the arm still swung."""
+    found = under_noise_seen(dataset, *beside_steps(setup, baseline, max_causes, workers), max_causes, workers)
+    return beside_steady_records(*found, max_causes, workers)
+
+
+def beside_steps(setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
+    """Causes of what the baseline leaves; beside the time steps of a simulation that made the records, where a model
+    with some of them shows these and the baseline was too far from the data for that."""
+
+    shown: list[Problem] = []
+
+    def shows_steps(fit: Fit) -> bool:
+        try:
+            stepped = with_steps(setup.problem, fit)[0] if fit.model.effects else setup.problem
+        except NOT_COMPUTED:
+            return False
+        if stepped is not setup.problem:
+            shown.append(stepped)
+        return bool(shown)
+
+    result = attribute(setup.problem, baseline, max_causes=max_causes, until=shows_steps, workers=workers)
+    if not shown or workers.late:
+        return setup, baseline, result
+    workers.say("time steps of a simulation")
+    first = fit_baseline(shown[-1], workers.say)
+    again = attribute(shown[-1], first, max_causes=max_causes, workers=workers)
+    return with_steps_of(setup, shown[-1]), first, again
+
+
+def under_noise_seen(
+    dataset: Dataset, setup: Setup, baseline: Fit, result: Attribution, max_causes: int, workers: Workers
+) -> tuple[Setup, Fit, Attribution]:
+    """Causes of what the baseline leaves, under the noise that is seen beside those found."""
+    try:
+        louder = with_noise_of_fast_lines(dataset, setup.problem, result.final)
+        if louder is not setup.problem and not workers.late:
+            workers.say("more noise")
+            setup, baseline = replace(setup, problem=louder), fit_baseline(louder, workers.say)
+            return setup, baseline, attribute(louder, baseline, max_causes=max_causes, workers=workers)
+        other, first = under_noise_beside_causes(dataset, setup, result.final)
+    except NOT_COMPUTED:
+        return setup, baseline, result
+    if other is setup or workers.late:
+        return setup, baseline, result
+    workers.say("less noise")
+    return other, first, attribute(other.problem, first, max_causes=max_causes, known=result, workers=workers)
+
+
+def beside_steady_records(
+    setup: Setup, baseline: Fit, result: Attribution, max_causes: int, workers: Workers
+) -> tuple[Setup, Fit, Attribution]:
+    """Causes beside records less what the arm swings by itself, where those found by then show it and the baseline was
+    too far from the data for that."""
+    final = result.final
+    shown = bool(result.rounds) and final.chi2_per_dof > DETECTION_EXCESS and not swings(setup.problem, baseline)
+    if not shown or workers.late or not swings(setup.problem, final):
+        return setup, baseline, result
+    workers.say("records less what swings")
+    try:
+        problem = without_swings(setup.problem, final)
+        first = renewed(problem, baseline)
+    except NOT_COMPUTED:
+        return setup, baseline, result
+    again = attribute(problem, first, max_causes=max_causes, known=result, workers=workers)
+    return replace(setup, problem=problem), first, again
+
+
+def unresolved(result: Attribution) -> bool:
+    """Whether so much is left without a cause, over noise and over the discrepancy, that links which are not as
+    described may be why."""
+    much = result.final.chi2_per_dof > LEFT_ERROR and result.left_share > LEFT_TO_LINKS
+    return result.detected and (much or result.unknown)
+
+
+def by_link_encoders(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> Sought | None:
+    """Causes sought in torque and link encoders together.
+
+    Link encoders of a real arm have errors of their own, and with links that are not those of the model what they show
+    of the gears belies its torque. Where these causes do not explain what both show, the torque alone says more,
+    if it shows anything.
+
+    Returns:
+        None where there is no such fit.
+    """
+    if not comparable_links(setup.problem):
+        return None
+    workers.say("link encoders")
+    late = find_link_delays(
+        setup.problem.groups,
+        predictions(setup.problem, baseline.model, baseline.remainders),
+        setup.problem.sampling.sample_time,
+    )
+    wide = set_up(dataset, fast=True)
+    recorded = wide.problem.groups
+    both, told = with_link_encoders(wide.problem, late), setup.problem
+    wide = replace(wide, problem=replace(both, q_std=told.q_std, tau_std=told.tau_std, sampling=told.sampling))
+    half = workers.for_half()
+    try:
+        fitted = fit_baseline(wide.problem, workers.say)
+        found = attribute(wide.problem, fitted, max_causes=max_causes, workers=half)
+    except NOT_COMPUTED:
+        return None
+    return Sought(wide, recorded, fitted, found, wide.problem.nominal, late=half.late)
+
+
+def explained(result: Attribution) -> bool:
+    """Whether causes found in torque and link encoders explain what both show."""
+    return bool(result.rounds) and result.detected and not result.unknown and result.left_share <= LEFT_BY_BOTH
+
+
+def with_inertias(found: Sought, max_causes: int, workers: Workers) -> Sought:
+    """Causes sought anew with inertias of the links and offsets of the torque found from motions, where that explains
+    far more.
+
+    The links of a real arm are not those of its description, torque records have offsets, and friction is
+    judged wrongly beside both.
+    """
+    workers.say("inertias of the links")
+    problem, result = found.setup.problem, found.result
+    try:
+        rigid = fit_rigid(problem.structure, problem.nominal, problem.groups)
+        problem = replace(problem, structure=rigid.structure, nominal=rigid.par)
+        offsets = tuple(
+            Effect(torque_offset(j, name), np.zeros(1)) for j, name in enumerate(problem.structure.robot.joint_names)
+        )
+        baseline = fit_baseline(problem, workers.say, offsets)
+    except NOT_COMPUTED:
+        return replace(found, late=found.late or workers.late)
+    if left_over(baseline, result.baseline) > 1.0:  # no better to begin with than the links of the description
+        return replace(found, late=found.late or workers.late)
+    other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
+    left = left_over(other.final, result.final)
+    if not worth_it(left, foretold(found.setup, result.final, other.final, workers)):
+        return replace(found, late=found.late or workers.late)
+    return replace(found, setup=replace(found.setup, problem=problem), result=other, rigid=rigid, late=workers.late)
+
+
+def inertias_foretell(setup: Setup) -> bool:
+    """Whether parts of the motions that are left out are predicted better with inertias found from the others.
+
+    Short motions fit well with other inertias that foretell nothing.
+    """
+    problem = setup.problem
+    try:
+        return carried_over(problem.structure, problem.nominal, problem.groups) <= CARRIED_OVER
+    except NOT_COMPUTED:
+        return False
+
+
+def worth_it(left: float, left_out: tuple[float, float]) -> bool:
+    """Whether inertias found are kept, by what they leave over what is left without.
+
+    Args:
+        left: of the motions that were fitted (``left_over``). Both sides have causes of their own, sought apart, which
+            makes this rough: it counts where it is much, and parts left out where it is not.
+        left_out: interval of the same on parts of them that were not (``foretold``).
+    """
+    least, most = left_out
+    return least <= 1.0 and (left <= SETTLED_BY_INERTIAS or most < 1.0)
+
+
+def foretold(setup: Setup, one: Fit, other: Fit, workers: Workers) -> tuple[float, float]:
+    """Interval of what ``other``, of inertias found, leaves of parts of the motions over what ``one`` leaves there
+    (``ratio_interval``), both fitted again without these parts; (inf, inf) where they cannot be.
+
+    Motions that are held out take no part in the choice: they measure what it gains.
+    """
+    try:
+        errors = errors_on_parts(setup.problem, one, other, workers, renewed=True)
+    except NOT_COMPUTED:
+        return np.inf, np.inf
+    return ratio_interval(errors, np.random.default_rng(SEED), TOWARDS)
+
+
+def left_over(one: Fit, other: Fit) -> float:
+    """What a fit leaves, over what another leaves: geometric mean over the joints, at each of them no less than
+    noise."""
+    logs = [np.log(np.maximum(fit.costs / fit.counts, 1.0)) for fit in (one, other)]
+    return float(np.exp(np.mean(logs[0] - logs[1])))
