@@ -14,38 +14,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.columns import Columns
-from ident.coordinates import (
-    PRIOR_LOG_STD,
-    TIMING_LIMIT,
-    clip_effects,
-    coordinate_names,
-    moves_geometry,
-    moves_links,
-    pack,
-    prior_of,
-    shifts_posture,
-    unpack,
-)
-from ident.costs import by_noise, fair_costs, has_scatter, weighted_cost
-from ident.derivatives import jacobians, normal_equations, shared_information, shared_slope
+from ident.coordinates import PRIOR_LOG_STD, coordinate_names, moves_links, pack, prior_of
+from ident.costs import fair_costs, has_scatter, weighted_cost
+from ident.derivatives import jacobians, normal_equations, shared_information
+from ident.descent import LEAST_RAISED, SLIGHT, Criterion, Point, descend, is_slow, needs_remainders
 from ident.errors_in_variables import information_left, trusted_share
 from ident.extended import Prediction
 from ident.inverse import REMAINDER_STEPS
-from ident.model import Model, has_loop
+from ident.model import Model
 from ident.parallel import one_thread_each
 from ident.problem import Problem, Weights, data_count, data_counts, predictions
 from ident.weights import make_weights
 
 HELD, HOLD = 0.1, 0.04  # error added to the noise from which drives are held, and how strongly
 ANNEALING = (0.5, 0.1, 0.02, 0.0)
-LOG_RANGE = 7.0  # of a baseline parameter about its starting guess: a factor of a thousand
 STALE = 1e-3  # change of logarithmic coordinates after which the geometric remainder is made anew
 GAP = 1e-6  # relative fall of the cost that ends a fit
 LEAST_INFORMATION = 1e-12  # on a coordinate: less counts as this
 RIDGE = 1e-12  # relative, of a covariance
-LOST = 1.2  # rise of the cost, with a geometric remainder made anew, that takes steps back
-SHORTER = 64.0  # factor on the damping of steps then
-SLIGHT = 2.0  # fall of the cost that tells nothing
+DAMPING = 1e-3  # of the first step, in units of the diagonal
+LESS_DAMPING, LEAST_DAMPING = 10.0, 1e-9  # what the damping is divided by after a step, and its least
+SHORTER = 64.0  # factor on the damping of steps that are taken back (``descent.LOST``)
+LEAST_FALL = 0.02  # fall of the cost in a step below which the fit ends
 CREEPING = 0.03  # share of the way to a cost aimed at, below which a step is the last
 # error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
 FORETOLD = 0.1
@@ -186,128 +176,81 @@ def fit(
     Raises:
         ArithmeticError: where the start costs more.
     """
-    limit = TIMING_LIMIT * problem.sampling.sample_time
     m = len(model.par.to_log())
     center, prior = prior_of(problem, model)
-    starts = [None] * len(problem.groups) if remainders is None else remainders
     count = data_count(problem)
     prior[:m] += hold * count
-    x = pack(model)
-    preds = predictions(problem, model, starts, steps=REMAINDER_STEPS)
-    Ws = [p.solution.W for p in preds]
+    starts = [None] * len(problem.groups) if remainders is None else remainders
+    found = predictions(problem, model, starts, steps=REMAINDER_STEPS)
     if weights is None:
-        weights = make_weights(problem, preds, rho)
-    cost = weighted_cost(problem, preds, weights)
+        weights = make_weights(problem, found, rho)
+    cost = weighted_cost(problem, found, weights)
     if np.isfinite(most) and not cost <= most:
         raise FloatingPointError(f"a start that costs {cost:.3g}, more than {most:.3g}")
-    settled = model, preds, Ws, cost
-    # of what noise adds to the cost, that is taken off
-    share: float | None = None if has_scatter(problem, model) else 0.0
     if problem.motions_alone:
         # Motions hardly show the gears. Where the model is far from the data their springs would follow its error.
         prior = prior * max(1.0, cost / count)
-    # The remainder holds the gravity torque of the chain, at one posture or along a motion: what changes either needs a
-    # new one, as softer gears do along a motion.
-    anew = problem.motions_alone or shifts_posture(model) or any(moves_geometry(e, False) for e in model.effects)
-    moves, drift = moves_links(model), np.zeros(len(x))
-    damping = 1e-3
-    converged = False
+    criterion = Criterion(problem, weights, center, prior)
+    at = settled = Point(model, pack(model), found, [p.solution.W for p in found], cost)
+    share_known = not has_scatter(problem, model)  # then nothing is taken off
+    anew, moves, drift = needs_remainders(problem, model), moves_links(model), np.zeros(len(at.x))
     exact = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
-    fine = False  # whether the steps are by exact derivatives already
-    # Columns beside loops take most of the time: each is a periodic motion of its own.
-    slow = any(has_loop(e) for e in model.effects)
+    fine = converged = False  # fine: whether the steps are by exact derivatives already
+    damping, slow = DAMPING, is_slow(model)
     columns: list[Columns] = []
     for _ in range(iterations):
         fresh = not columns
-        columns = columns or jacobians(problem, model, preds, exact=fine)
-        H, b = normal_equations(problem, columns, preds, weights)
-        off = x - center
-        if share is None:
-            share = trusted_share(H, shared_information(problem, model, preds, weights))
-        if share:
-            b = b - share * shared_slope(problem, model, preds, weights)
-        noise = share * np.sum(by_noise(problem, preds, weights)) if share else 0.0
-        H_p, b_p = H + np.diag(prior), b - prior * off
-        size = np.diag(H_p).copy()
-        size[size <= 0] = 1.0
-        for _ in range(6):
-            step = np.linalg.solve(H_p + damping * np.diag(size), b_p)
-            step[:m] = np.clip(step[:m], -1.0, 1.0)
-            step[m + 1 :] = clip_effects(model, step[m + 1 :])
-            step[:m] = np.clip(x[:m] + step[:m], center[:m] - LOG_RANGE, center[:m] + LOG_RANGE) - x[:m]
-            try:
-                if not np.all(np.isfinite(step)):
-                    raise FloatingPointError("a step without a size")
-                trial = unpack(model, x + step, limit)
-                new = predictions(problem, trial, Ws, steps=REMAINDER_STEPS if anew or fine else 0, near=preds)
-                new_cost = weighted_cost(problem, new, weights)
-                new_noise = share * np.sum(by_noise(problem, new, weights)) if share else 0.0
-            except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-                new_cost = new_noise = np.inf
-            gain = (cost - noise) - (new_cost - new_noise) if np.isfinite(new_cost) else -np.inf
-            penalty = np.sum(prior * ((off + step) ** 2 - off**2))
-            foretold = float(2.0 * b @ step - step @ H @ step)
-            improved = bool(gain > penalty)
-            # A step whose parts are cut to size may be foretold to lead uphill: a shorter one does not.
-            if improved or (slow and abs(foretold) < SLIGHT):
-                break
-            damping = max(damping, 1e-4) * 8
-        if not improved:
+        columns = columns or jacobians(problem, at.model, at.predictions, exact=fine)
+        H, b = normal_equations(problem, columns, at.predictions, weights)
+        if not share_known:
+            share = trusted_share(H, shared_information(problem, at.model, at.predictions, weights))
+            criterion, share_known = replace(criterion, share=share), True
+            at = settled = replace(at, noise=criterion.noise(at.predictions))
+        step, damping = descend(criterion, at, H, b, damping, anew or fine)
+        if step is None:
             converged = fresh and fine == exact
             if converged:
                 break
-            fine, damping, columns = fine if not fresh else True, 1e-3, []
+            fine, damping, columns = fine or fresh, DAMPING, []
             continue
-        if not (slow and abs(gain - foretold) <= max(FORETOLD * foretold, SLIGHT)):
+        if not (slow and abs(step.gain - step.foretold) <= max(FORETOLD * step.foretold, SLIGHT)):
             columns = []
-        drift += np.abs(pack(trial) - x)
-        model, x = trial, pack(trial)
-        damping = max(damping / 10, 1e-9)
-        preds, cost = new, new_cost
+        drift += np.abs(step.to.x - at.x)
+        at, damping = step.to, max(damping / LESS_DAMPING, LEAST_DAMPING)
         if np.max(np.where(moves, drift, 0.0)) > STALE:
-            kept, settled = settled, _settled(problem, settled, model, weights)
-            model, preds, Ws, cost = settled
-            x, drift = pack(model), np.zeros(len(x))
-            if settled is kept:
-                damping, columns = max(damping, 1e-4) * SHORTER, []
+            at, drift = criterion.settled(settled, at), np.zeros(len(at.x))
+            if at is settled:
+                damping, columns = max(damping, LEAST_RAISED) * SHORTER, []
                 continue
+            settled = at
         if progress is not None:
-            progress(f"fit: chi2/dof {cost / count:.3g}")
-        if gain < max(gap * cost, 0.02):
+            progress(f"fit: chi2/dof {at.cost / count:.3g}")
+        if step.gain < max(gap * at.cost, LEAST_FALL):
             converged = fine == exact
             if converged:
                 break
             fine, columns = True, []
-        if gain < CREEPING * (cost - aim):
+        if step.gain < CREEPING * (at.cost - aim):
             break
     if np.any(drift):
-        model, preds, Ws, _ = _settled(problem, settled, model, weights)
+        at = criterion.settled(settled, at)
     if fine != exact or not columns:
-        columns = jacobians(problem, model, preds, exact=exact)
-    H, _ = normal_equations(problem, columns, preds, weights)
-    if share:
-        H = information_left(H, share * shared_information(problem, model, preds, weights))
-    costs = fair_costs(problem, preds, weights)
-    names = coordinate_names(model)
-    return Fit(model, costs, data_counts(problem), H, names, tuple(Ws), weights, converged, share=share or 0.0)
-
-
-Settled = tuple[Model, list[Prediction], list[np.ndarray], float]
-"""A model, its predictions, the geometric remainders that they were made with, and its cost."""
-
-
-def _settled(problem: Problem, last: Settled, model: Model, weights: Weights) -> Settled:
-    """``model`` with its own geometric remainders, else ``last``.
-
-    Steps are taken with the remainder held. Where the links hang on gears that are far too soft the
-    remainder answers them so strongly that a step which lowers the cost raises it in truth.
-    """
-    try:
-        preds = predictions(problem, model, last[2], steps=REMAINDER_STEPS, near=last[1])
-        cost = weighted_cost(problem, preds, weights)
-    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-        return last
-    return (model, preds, [p.solution.W for p in preds], cost) if cost < LOST * last[3] else last
+        columns = jacobians(problem, at.model, at.predictions, exact=exact)
+    H, _ = normal_equations(problem, columns, at.predictions, weights)
+    if criterion.share:
+        shared = shared_information(problem, at.model, at.predictions, weights)
+        H = information_left(H, criterion.share * shared)
+    return Fit(
+        model=at.model,
+        costs=fair_costs(problem, at.predictions, weights),
+        counts=data_counts(problem),
+        information=H,
+        names=coordinate_names(at.model),
+        remainders=tuple(at.remainders),
+        weights=weights,
+        converged=converged,
+        share=criterion.share,
+    )
 
 
 def left_beside(

@@ -11,6 +11,7 @@ from ident.chain import build_structure
 from ident.coordinates import pack, unpack
 from ident.costs import joint_costs
 from ident.derivatives import jacobian
+from ident.descent import SLIGHT
 from ident.diagnosis import diagnose
 from ident.estimate import ESTIMATORS, fit_frf
 from ident.extended import predict
@@ -25,7 +26,7 @@ from ident.problem import output_error, predictions
 from ident.refits import reweighted
 from ident.refuted import leave_one_out
 from ident.screening import screen
-from ident.torque_fit import SLIGHT, fit
+from ident.torque_fit import fit
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
 from sim import parse_effect
@@ -313,6 +314,7 @@ def test_columns_beside_a_loop_serve_as_long_as_they_foretell_the_cost(panda_pro
 
     (kept, some), (_, plain) = fitted(GEAR, [1e9]), fitted(LAG, [2e-3, 0.0])
     monkeypatch.setattr("ident.torque_fit.SLIGHT", 0.0)
+    monkeypatch.setattr("ident.descent.SLIGHT", 0.0)
     monkeypatch.setattr("ident.torque_fit.FORETOLD", 0.0)
     fresh, every = fitted(GEAR, [1e9])
     assert some < 0.8 * every
