@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,122 +28,156 @@ LINEAR_UNITS = {
     "kN m": "kN",
 }
 
+# Channels that a map needs: what they are, and their units of joints that turn and of linear ones.
+MISSED = {"tau": ("motor torque or current", ("N m", "N")), "q": ("motor position", ("rad", "m"))}
+
 LONGEST_NOTE = 1000  # characters
+MOST_UNUSED = 60  # signals that are listed
 
 
-def render(
-    paths: list[Path],
-    arm: Robot,
-    parts: dict[str, tuple[Path, int | None]],
-    clocks: dict[str, FileClock],
-    time: FoundTime,
-    chosen: dict[str, Family],
-    others: dict[str, list[Family]],
-    scales: dict[str, Scale],
-    families: list[Family],
-    linear: np.ndarray,
-    doubts: Mapping[str, str],
-) -> str:
+@dataclass(frozen=True)
+class Guess:
+    """What was guessed of a log.
+
+    Attributes:
+        parts: prefix -> (file, width) of one log over several files; clocks: by prefix, where each has one of its own.
+        chosen: channel -> signals taken for it; others: that might also be it; scales: their units, by channel.
+        families: all signals. linear: (n,) joints that are.
+        doubts: name of a signal -> what is doubtful about how it was read.
+    """
+
+    paths: Sequence[Path]
+    arm: Robot
+    parts: Mapping[str, tuple[Path, int | None]]
+    clocks: Mapping[str, FileClock]
+    time: FoundTime
+    chosen: Mapping[str, Family]
+    others: Mapping[str, Sequence[Family]]
+    scales: Mapping[str, Scale]
+    families: Sequence[Family]
+    linear: np.ndarray
+    doubts: Mapping[str, str]
+
+
+def render(guess: Guess) -> str:
     """A map file in TOML, with what was guessed, why, and what is to be edited."""
-    lines = [
-        f"# First map of {plain(paths[0].name)} for the robot {plain(arm.name)}: guessed, so check every line,",
-        "# above all those marked EDIT. Result: tau in N m (N), q in rad (m), both on the link side of the gear.",
-        f"sample_rate = {time.rate or 1000.0!r}" + _rate_note(time, bool(clocks)),
-        'input_hold = "none"      # "zoh" where the torque is held over a sample',
-    ]
-    if len(paths) == 1 or parts:
-        lines.append("split = 0.7              # the first 70 % identify, the rest validates")
-    elif len(paths) > 1:
-        lines += [
-            "",
-            "[roles]",
-            *(f'{quoted(p.name)} = "{"validation" if p is paths[-1] else "identification"}"' for p in paths),
-        ]
-    if parts:
-        lines += ["", "[files]                  # one log over several files; their signals are prefix:name"]
-        for prefix, (path, width) in parts.items():
-            options = [f"name = {quoted(path.name)}", *([f"width = {width}"] if width else [])]
-            clock = clocks.get(f"{prefix}:")
-            if clock is not None:
-                options += [f"time = {quoted(clock.name)}", *([f'unit = "{clock.unit}"'] if clock.unit else [])]
-            lines.append(f"{quoted(prefix)} = {{ {', '.join(options)} }}")
-        if clocks:
-            lines.append("# Each has a time of its own: they are joined where all of them have samples.")
+    sections = (_head, _files, _time, _columns, _multisine, _unused)
+    return "\n".join(line for section in sections for line in section(guess)) + "\n"
+
+
+def _head(guess: Guess) -> Iterator[str]:
+    yield f"# First map of {plain(guess.paths[0].name)} for the robot {plain(guess.arm.name)}: guessed, so check every line,"
+    yield "# above all those marked EDIT. Result: tau in N m (N), q in rad (m), both on the link side of the gear."
+    yield f"sample_rate = {guess.time.rate or 1000.0!r}" + _rate_note(guess.time, bool(guess.clocks))
+    yield 'input_hold = "none"      # "zoh" where the torque is held over a sample'
+    if len(guess.paths) == 1 or guess.parts:
+        yield "split = 0.7              # the first 70 % identify, the rest validates"
+        return
+    yield from ("", "[roles]")
+    for path in guess.paths:
+        yield f'{quoted(path.name)} = "{"validation" if path is guess.paths[-1] else "identification"}"'
+
+
+def _files(guess: Guess) -> Iterator[str]:
+    if not guess.parts:
+        return
+    yield from ("", "[files]                  # one log over several files; their signals are prefix:name")
+    for prefix, (path, width) in guess.parts.items():
+        options = [f"name = {quoted(path.name)}", *([f"width = {width}"] if width else [])]
+        clock = guess.clocks.get(f"{prefix}:")
+        if clock is not None:
+            options += [f"time = {quoted(clock.name)}", *([f'unit = "{clock.unit}"'] if clock.unit else [])]
+        yield f"{quoted(prefix)} = {{ {', '.join(options)} }}"
+    if guess.clocks:
+        yield "# Each has a time of its own: they are joined where all of them have samples."
+
+
+def _time(guess: Guess) -> Iterator[str]:
+    time = guess.time
     if time.source is not None:
-        lines += [
-            "",
-            "[time]" + (f"                   # {plain(time.doubt)}" if time.doubt else ""),
-            f"source = {quoted(time.source)}",
-        ]
-        lines += [f'unit = "{time.unit}"'] if time.unit else ["# dates, which need no unit"]
+        yield from ("", "[time]" + (f"                   # {plain(time.doubt)}" if time.doubt else ""))
+        yield f"source = {quoted(time.source)}"
+        yield f'unit = "{time.unit}"' if time.unit else "# dates, which need no unit"
         if time.plus:
-            lines.append(
-                "plus = [" + ", ".join(f'{{ source = {quoted(s)}, unit = "{u}" }}' for s, u in time.plus) + "]"
-            )
+            added = ", ".join(f'{{ source = {quoted(s)}, unit = "{u}" }}' for s, u in time.plus)
+            yield f"plus = [{added}]"
     elif time.lost is not None:
         name, unit, why = time.lost
-        lines += [
-            "",
-            f"# EDIT: {plain(name)} is not used as the time: it {why}.",
-            "# Mend the log, or leave it out: the samples then count as even.",
-            "# [time]",
-            f"# source = {quoted(name)}",
-        ]
-        lines += [f'# unit = "{unit}"'] if unit else []
-    lines += ["", "[columns]"]
+        yield from ("", f"# EDIT: {plain(name)} is not used as the time: it {why}.")
+        yield "# Mend the log, or leave it out: the samples then count as even."
+        yield from ("# [time]", f"# source = {quoted(name)}")
+        if unit:
+            yield f'# unit = "{unit}"'
+
+
+def _columns(guess: Guess) -> Iterator[str]:
+    yield from ("", "[columns]")
     for channel in CHANNELS:
-        if channel not in chosen:
-            if channel in ("tau", "q"):
-                meaning = "motor torque or current" if channel == "tau" else "motor position"
-                lines += ["", f"# EDIT: nothing in the log looks like the {meaning}; complete and take the # away"]
-                units = {"tau": ("N m", "N"), "q": ("rad", "m")}[channel]
-                lines += [
-                    f'# {channel}_{j + 1} = {{ source = "...", unit = "{units[int(linear[j])]}" }}'
-                    for j in range(arm.n)
-                ]
+        if channel in guess.chosen:
+            yield from _channel(guess, channel)
+        elif channel in MISSED:
+            meaning, units = MISSED[channel]
+            yield from ("", f"# EDIT: nothing in the log looks like the {meaning}; complete and take the # away")
+            for j, linear in enumerate(guess.linear):
+                yield f'# {channel}_{j + 1} = {{ source = "...", unit = "{units[int(linear)]}" }}'
+
+
+def _channel(guess: Guess, channel: str) -> Iterator[str]:
+    """The columns of a channel, with what was guessed about them."""
+    family, scale, doubts = guess.chosen[channel], guess.scales[channel], guess.doubts
+    damaged = (
+        f"EDIT: {plain(name)} has {plain(doubts[name])}" for name, _ in dict(family.sources).items() if name in doubts
+    )
+    notes = plain("; ".join(note for note in (family.note, scale.note, *damaged) if note), LONGEST_NOTE)
+    yield from ("", f"# {channel}: {notes}" if notes else f"# {channel}")
+    if guess.others[channel]:
+        yield "# might also be: " + ", ".join(plain(f.name) for f in guess.others[channel])
+    broken = channel == "qd" and "EDIT" in scale.note
+    for j, (source, index) in enumerate(family.sources):
+        # Only encoders at the link may be at some joints alone.
+        if channel == "q_link" and np.ptp(family.x[:, j]) == 0:
+            yield f"# {channel}_{j + 1} is constant in the log"
             continue
-        family, scale = chosen[channel], scales[channel]
-        damaged = (
-            f"EDIT: {plain(name)} has {plain(doubts[name])}"
-            for name, _ in dict(family.sources).items()
-            if name in doubts
-        )
-        notes = plain("; ".join(note for note in (family.note, scale.note, *damaged) if note), LONGEST_NOTE)
-        lines += ["", f"# {channel}: {notes}" if notes else f"# {channel}"]
-        if others[channel]:
-            lines.append("# might also be: " + ", ".join(plain(f.name) for f in others[channel]))
-        broken = channel == "qd" and "EDIT" in scale.note
-        for j, (source, index) in enumerate(family.sources):
-            forward = channel == "tau" and scale.signs is not None and not scale.signs[j] < 0
-            options = [o for o in scale.options if not (forward and o == "sign = -1")]
-            if linear[j] and not np.all(linear):
-                options = [
-                    f'unit = "{LINEAR_UNITS[u]}"' if (u := o[len('unit = "') : -1]) in LINEAR_UNITS else o
-                    for o in options
-                ]
-            options = [
-                f"source = {quoted(source)}",
-                *([] if index is None or index == j else [f"index = {index}"]),
-                *options,
-            ]
-            # Only encoders at the link may be at some joints alone.
-            if channel == "q_link" and np.ptp(family.x[:, j]) == 0:
-                lines.append(f"# {channel}_{j + 1} is constant in the log")
-                continue
-            lines.append(f"{'# ' if broken else ''}{channel}_{j + 1} = {{ {', '.join(options)} }}")
-    period = period_of(chosen)
-    if period is not None:
-        N = len(chosen["tau"].x)
-        lines += [
-            "", f"# The torque repeats every {period} samples: for a multisine around one posture take the # away (and `split`).",
-            "# [multisine]", f"# period = {period}", '# operating_point = "op01"', "# excited_lines = [1, 3, 5]   # EDIT, or excited_from = a signal",
-            "# [[multisine.part]]", "# first = 2                # the first period has the transient", f"# last = {max(2, N // period)}",
-            '# role = "identification"',
-        ]  # fmt: skip
-    unused = [f for f in families if f.name not in time.sources and f.name not in {c.name for c in chosen.values()}]
+        options = [f"source = {quoted(source)}", *([] if index is None or index == j else [f"index = {index}"])]
+        options += _options_at(scale, channel, j, guess.linear)
+        yield f"{'# ' if broken else ''}{channel}_{j + 1} = {{ {', '.join(options)} }}"
+
+
+def _options_at(scale: Scale, channel: str, j: int, linear: np.ndarray) -> list[str]:
+    """Unit, sign and gear of a joint, where they are those of the other joints but for what it is."""
+    forward = channel == "tau" and scale.signs is not None and not scale.signs[j] < 0
+    options = [o for o in scale.options if not (forward and o == "sign = -1")]
+    if not linear[j] or np.all(linear):
+        return options
+    in_length = {f'unit = "{angle}"': f'unit = "{length}"' for angle, length in LINEAR_UNITS.items()}
+    return [in_length.get(o, o) for o in options]
+
+
+def _multisine(guess: Guess) -> Iterator[str]:
+    period = period_of(guess.chosen)
+    if period is None:
+        return
+    last = max(2, len(guess.chosen["tau"].x) // period)
+    yield from (
+        "",
+        f"# The torque repeats every {period} samples: for a multisine around one posture take the # away (and `split`).",
+        "# [multisine]",
+        f"# period = {period}",
+        '# operating_point = "op01"',
+        "# excited_lines = [1, 3, 5]   # EDIT, or excited_from = a signal",
+        "# [[multisine.part]]",
+        "# first = 2                # the first period has the transient",
+        f"# last = {last}",
+        '# role = "identification"',
+    )
+
+
+def _unused(guess: Guess) -> Iterator[str]:
+    used = guess.time.sources | {f.name for f in guess.chosen.values()}
+    unused = [f for f in guess.families if f.name not in used]
     if unused:
-        lines += ["", "# Not used:"] + [f"#   {plain(f.name)}: {range_text(f.x)}" for f in unused[:60]]
-    return "\n".join(lines) + "\n"
+        yield from ("", "# Not used:")
+        yield from (f"#   {plain(f.name)}: {range_text(f.x)}" for f in unused[:MOST_UNUSED])
 
 
 def _rate_note(time: FoundTime, joined: bool) -> str:
@@ -153,7 +188,7 @@ def _rate_note(time: FoundTime, joined: bool) -> str:
     return "" if time.rate is not None else "        # EDIT: Hz; the log has no time column that was found"
 
 
-def period_of(chosen: dict[str, Family]) -> int | None:
+def period_of(chosen: Mapping[str, Family]) -> int | None:
     """Samples after which the torque repeats, at least three times; None where it does not."""
     if "tau" not in chosen:
         return None
