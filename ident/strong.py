@@ -110,14 +110,38 @@ def beside_strong(
             pairs += at_joint
             if left_by(at_joint) < ANSWERED * min(left_by(ranked), before.cost - before.count):
                 break
-    strong = [(h, r) for h, r in pairs if not is_along_record(h)]
+    strong = proven(problem, before, pairs, ranked, workers)
+    if not left_by(strong) < left_by(ranked):
+        return before, list(ranked)
+    best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
+    for h, r in sorted(strong, key=lambda x: x[1].cost):
+        best.setdefault(h.key, (h, r))
+    others = [(h, r) for h, r in ranked if h.key not in best]
+    return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+
+
+def proven(
+    problem: Problem,
+    before: Fit,
+    found: Sequence[tuple[Hypothesis, Fit]],
+    ranked: Sequence[tuple[Hypothesis, Fit]],
+    workers: Workers,
+) -> list[tuple[Hypothesis, Fit]]:
+    """Strong candidates that stay: all but laws along the record that a simulated law, or a candidate without a loop,
+    does as well as; each as a loop where that does as well.
+
+    Args:
+        ranked: the candidates that are not strong.
+    """
+    best = min((r for _, r in ranked), key=lambda r: r.cost, default=None)
+    strong = [(h, r) for h, r in found if not is_along_record(h)]
     # Noise along the record is taken large: a law that leaves as much even in that as no law, or clearly more than the
     # best, is far off.
-    allowed = np.minimum(before.costs, FAR_BEHIND * top[1].costs) if top else before.costs
+    allowed = np.minimum(before.costs, FAR_BEHIND * best.costs) if best else before.costs
     along = sorted(
         (
             (h, r)
-            for h, r in pairs
+            for h, r in found
             if is_along_record(h) and r.costs[h.joint] < allowed[h.joint] and not implausible(problem, r, [h.joint])
         ),
         key=lambda x: x[1].cost,
@@ -133,13 +157,7 @@ def beside_strong(
         )
         whole = [r for r in own if r is not None]
         strong = [(h, r) for h, r in strong if not (is_along_record(h) and matched(problem, h.joint, r, whole))]
-    if not left_by(strong) < left_by(ranked):
-        return before, list(ranked)
-    best: dict[tuple[str, str], tuple[Hypothesis, Fit]] = {}
-    for h, r in sorted(strong, key=lambda x: x[1].cost):
-        best.setdefault(h.key, (h, r))
-    others = [(h, r) for h, r in ranked if h.key not in best]
-    return under_noise_of_best(problem, before, [*best.values(), *others], workers)
+    return strong
 
 
 def without_strong(problem: Problem, current: Fit) -> tuple[Fit, ...]:
