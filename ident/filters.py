@@ -23,7 +23,7 @@ from ident.chain import Structure
 from ident.graybox import Parameters, equilibrium, linearise
 from ident.kalman import Kalman, held, kalman, spring_torque, state_space
 from ident.predict import Noise, Prediction, Predictor, Runs, gaussian
-from ident.recursion import along_z, chain_of, recursion
+from ident.recursion import along_z, chain_of, recursion, sines
 from robot_assets.errors import DataError
 
 NUDGE = 1e-6  # rad and rad/s, differences of inverse dynamics
@@ -188,7 +188,8 @@ def _solve(M, B):
 @njit(cache=True, nogil=True)
 def _inverse_dynamics(chain, q, v, a):
     parent, prismatic, rotation, origin, mass, lever, inertia, gravity = chain
-    return recursion(parent, prismatic, rotation, origin, mass, lever, inertia, gravity, q, np.sin(q), np.cos(q), v, a)
+    sine, cosine = sines(q)
+    return recursion(parent, prismatic, rotation, origin, mass, lever, inertia, gravity, q, sine, cosine, v, a)
 
 
 @njit(cache=True, nogil=True)
