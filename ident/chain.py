@@ -14,8 +14,6 @@ from robot_assets.errors import DataError
 from robot_assets.robot import Elasticity, Robot
 from robot_assets.urdf import completed
 
-_AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-
 
 @dataclass(frozen=True)
 class LinkChange:
@@ -139,7 +137,7 @@ def build_structure(
         below, placement = _add_hinges(
             model, carrier[source.parents[i]], [h for h in own if h.before], source.jointPlacements[i]
         )
-        k = model.addJoint(below, _joint_model(joint), placement, name)
+        k = model.addJoint(below, _joint_model(joint, pin.neutral(source)), placement, name)
         index[name] = model.idx_vs[k]
         carrier[i], _ = _add_hinges(model, k, [h for h in own if not h.before], pin.SE3.Identity())
         body, change = known.get(name, source.inertias[i]), changed.get(i, LinkChange())
@@ -227,14 +225,20 @@ def _links(model: pin.Model) -> list[pin.Frame]:
     return [f for f in model.frames if f.type == pin.FrameType.BODY]
 
 
-def _joint_model(joint: pin.JointModel) -> pin.JointModel:
-    """The same axis as a joint of one coordinate (a URDF "continuous" joint has two)."""
-    kind = joint.shortname()
-    prismatic = "JointModelP" in kind
-    axis = np.asarray(joint.extract().axis if "Unaligned" in kind else _AXES.get(kind[-1], (0.0, 0.0, 0.0)), float)
-    if not np.any(axis):
-        raise DataError("joint", kind, "a joint of several degrees of freedom", "revolute or prismatic")
-    return pin.JointModelPrismaticUnaligned(axis) if prismatic else pin.JointModelRevoluteUnaligned(axis)
+def _joint_model(joint: pin.JointModel, neutral: np.ndarray) -> pin.JointModel:
+    """The same axis as a joint of one coordinate (a URDF "continuous" joint has two).
+
+    Args:
+        neutral: a configuration of its chain.
+    """
+    data = joint.createData()
+    joint.calc(data, neutral)
+    freedom = np.asarray(data.S).reshape(6, -1)
+    slides, turns = (bool(np.any(part)) for part in (freedom[:3], freedom[3:]))
+    if freedom.shape != (6, 1) or slides == turns:
+        raise DataError("joint", joint.shortname(), "a joint of several degrees of freedom", "revolute or prismatic")
+    axis = freedom[:3, 0] if slides else freedom[3:, 0]
+    return pin.JointModelPrismaticUnaligned(axis) if slides else pin.JointModelRevoluteUnaligned(axis)
 
 
 def _hinge_name(hinge: Elasticity) -> str:

@@ -52,6 +52,40 @@ def test_links_may_bear_the_names_of_joints(irb, tmp_path):
     assert build_plant(same).model.nv == build_plant(irb).model.nv
 
 
+@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
+@pytest.mark.parametrize("axis", ["1 0 0", "0 -1 0", "0 0 2", "1 -2 0.5"])
+def test_joints_of_any_kind_turn_about_any_axis(tmp_path, kind, axis):
+    """A URDF "continuous" joint has two coordinates in Pinocchio, under names of their own about most axes."""
+    (tmp_path / "arm.urdf").write_text(f"""<robot name="arm"><link name="base"/><link name="beam"><inertial>
+      <origin xyz="0.3 0.2 -0.1"/><mass value="2"/>
+      <inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0" ixz="0.01" iyz="0"/></inertial></link>
+      <joint name="axle" type="{kind}"><parent link="base"/><child link="beam"/><axis xyz="{axis}"/>
+      <limit lower="-1" upper="1" effort="10" velocity="1"/></joint></robot>""")
+    (tmp_path / "robot.toml").write_text("""name = "arm"
+urdf = "arm.urdf"
+[[joint]]
+name = "axle"
+gear_ratio = 50.0
+motor_inertia = 1.0
+stiffness = 1000.0
+damping = 1.0
+viscous_friction = 1.0
+""")
+    robot = load_robot(tmp_path)
+    structure, plant = build_structure(robot), build_plant(robot)
+    (q,) = equilibrium(structure, Parameters.nominal(robot), np.zeros(1))
+    lin = linearise(structure, np.array([q]))
+    assert structure.n_coordinates == 1
+    data = mujoco.MjData(plant.model)
+    data.qpos[:] = q
+    mujoco.mj_forward(plant.model, data)
+    M = np.zeros((plant.model.nv, plant.model.nv))
+    mujoco.mj_fullM(plant.model, data, M)
+    at = plant.link[0]
+    assert lin.M[0, 0] == pytest.approx(M[at, at], rel=1e-9)
+    assert lin.g[0] == pytest.approx(data.qfrc_bias[at], rel=1e-9, abs=1e-9)
+
+
 def test_irb_has_six_springs_along_its_axes_and_six_across(irb):
     assert irb.n == 6
     assert [e.joint for e in irb.elasticities] == [f"joint_{j}" for j in (1, 1, 2, 2, 3, 3)]
