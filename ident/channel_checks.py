@@ -12,6 +12,9 @@ import scipy.signal
 
 from ident.chain import build_structure
 from ident.dataset import Dataset, Segment
+from ident.lost_samples import CHANNELS as REPEATED
+from ident.lost_samples import repeated as repeated_samples
+from ident.lost_samples import resolution
 from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
@@ -194,8 +197,8 @@ def _amid_motion(q: np.ndarray, a: int, b: int, still: np.ndarray, rate: float) 
     bend = np.abs(q[: -2 * near] - 2 * q[near:-near] + q[2 * near :])[runs]
     if len(bend) < 32:
         return False
-    resolution = np.array([_resolution(x) for x in np.diff(q, axis=0).T])
-    least = ABRUPT * np.maximum(np.percentile(bend, 99, axis=0), resolution)
+    counts = np.array([resolution(x) for x in np.diff(q, axis=0).T])
+    least = ABRUPT * np.maximum(np.percentile(bend, 99, axis=0), counts)
     return bool(np.any((before * after > 0) & (np.minimum(np.abs(before), np.abs(after)) > least)))
 
 
@@ -206,8 +209,8 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
     noise = np.maximum(difference_noise(s.q), 1e-300) if len(s.q) > 8 else np.full(dataset.n, np.inf)
     usual = scipy.signal.medfilt(np.abs(step), (9, 1)) if len(step) > 9 else np.abs(step)
     # Where a joint moves so fast that a lost sample stands out of noise and resolution.
-    resolution = np.array([_resolution(x) for x in step.T])
-    fast = usual > 8 * np.maximum(noise, resolution)
+    counts = np.array([resolution(x) for x in step.T])
+    fast = usual > 8 * np.maximum(noise, counts)
     moving = np.any(fast, axis=1)
     repeated = int(np.sum(np.all(rows[1:] == rows[:-1], axis=1) & moving))
     # A lost sample is lost for all joints; one joint alone may stumble by itself.
@@ -222,6 +225,15 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
         out.append(
             f"{repeated} samples ({repeated / len(rows):.1%}) repeat the one before in all channels, in motion: lost packets"
         )
+    together = np.append(False, np.all(rows[1:] == rows[:-1], axis=1))
+    for channel in REPEATED:
+        x = getattr(s, channel)
+        for j, name in enumerate(dataset.joints if x is not None else ()):
+            share = float(np.mean(repeated_samples(x[:, j]) & ~together))
+            if share > 0.0:
+                out.append(
+                    f"{channel}_{j + 1} ({name}): {share:.1%} of the samples repeat the one before, in motion: lost samples"
+                )
     if jumps > max(2, 1e-3 * moving.sum()):
         out.append(f"{jumps} double steps of position between samples: dropped samples")
     return out
@@ -236,17 +248,6 @@ def _recurring(found: np.ndarray, period: int | None) -> np.ndarray:
     place = np.arange(len(found)) % period
     often = np.bincount(place, weights=found, minlength=period) > 0.5 * periods
     return often[place]
-
-
-def _resolution(step: np.ndarray) -> float:
-    """The smallest step that is no rounding error: of an encoder, its count."""
-    size = np.abs(step[step != 0])
-    if not len(size):
-        return 0.0
-    size = size[size > 1e-9 * size.max()]
-    counts = size / size.min()
-    whole = np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95
-    return float(size.min()) if whole else 0.0
 
 
 def excitation_warnings(s: Segment, dataset: Dataset) -> list[str]:

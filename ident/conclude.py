@@ -14,6 +14,7 @@ from ident.evidence import Candidate, pointless
 from ident.extended import Prediction
 from ident.identification import RUNAWAY, Setup
 from ident.link_sensor import LinkDelay
+from ident.lost_samples import LostSamples
 from ident.model import Effect, is_along_record
 from ident.next_experiment import NextExperiment, advice
 from ident.notes import (
@@ -24,6 +25,7 @@ from ident.notes import (
     few_note,
     held_out_note,
     inertia_note,
+    lost_note,
     nameless_note,
     record_note,
     roll_off_note,
@@ -77,7 +79,8 @@ class Findings:
         separating: the experiment that would tell tied causes apart.
         rigid: inertias of the links where they were found too.
         belied: causes, by ``key``, that held-out data deny (``trust.denied``).
-        tones: what does not repeat with the period. Where nothing else is found it is an unknown cause.
+        tones: what does not repeat with the period; lost: samples that were. Where nothing else is found these are an
+            unknown cause.
     """
 
     dataset: Dataset
@@ -93,6 +96,7 @@ class Findings:
     rigid: RigidFit | None = None
     belied: Collection[tuple[str, str]] = ()
     tones: Sequence[Tone] = ()
+    lost: Sequence[LostSamples] = ()
 
     @property
     def final(self) -> Fit:
@@ -120,10 +124,11 @@ def conclude(found: Findings) -> Verdict:
     dataset, result, joints = found.dataset, found.result, found.dataset.joints
     tones = of_their_own(found.tones, found.final)
     direct = seen_in_samples(found)
-    tones_alone = bool(tones) and not result.detected and not direct
+    nameless = bool(tones) or any(not x.every for x in found.lost)
+    alone = nameless and not result.detected and not direct
     refuted = is_refuted(found)
-    unknown = cause_remains(found, refuted) or tones_alone
-    detected = result.detected or bool(direct) or tones_alone
+    unknown = cause_remains(found, refuted) or alone
+    detected = result.detected or bool(direct) or alone
     causes = (*named_causes(found, refuted), *direct)
     values, undetermined = parameters_of(found)
     return Verdict(
@@ -131,12 +136,12 @@ def conclude(found: Findings) -> Verdict:
         baseline=values,
         discrepancy=Discrepancy(
             detected,
-            0.0 if direct or tones_alone else result.p_value,
+            0.0 if direct or alone else result.p_value,
             found.baseline.chi2_per_dof,
             tuple(places(found, tones)),
         ),
         causes=causes,
-        unexplained_share=1.0 if tones_alone else found.left,
+        unexplained_share=1.0 if alone else found.left,
         unexplained_verdict=UNKNOWN if unknown else "noise floor reached",
         gain=found.gain,
         next_experiment=found.separating.text if found.separating else advice(causes, unknown, len(joints)),
@@ -215,12 +220,14 @@ def places(found: Findings, tones: Sequence[Tone]) -> Iterator[Where]:
         yield from fitted
         return
     joints = found.dataset.joints
-    for x in found.setup.steps:
-        yield Where(joints[x.joint], "q", "position in steps", 1.0)
+    for steps in found.setup.steps:
+        yield Where(joints[steps.joint], "q", "position in steps", 1.0)
     for tone in tones:
         yield Where(joints[tone.joint], "tau", f"a tone at {tone.frequency_hz:.4g} Hz", 1.0)
     for lag in found.late:
         yield Where(joints[lag.joint], "q_link", "position that follows the velocity", 1.0)
+    for lost in found.lost:
+        yield Where(joints[lost.joint], lost.channel, "samples that repeat the one before", 1.0)
 
 
 def parameters_of(found: Findings) -> tuple[dict[str, Value], tuple[str, ...]]:
@@ -247,6 +254,7 @@ def notes_on(found: Findings, causes: Sequence[Cause], tones: Sequence[Tone], de
     if not named:
         yield from drift_note(problem)
     yield from (tone_note(x, joints[x.joint]) for x in tones)
+    yield from (lost_note(x, joints[x.joint]) for x in found.lost)
     yield from (belied_note(e) for e in named if e.hypothesis.key in found.belied)
     yield from (nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy)
     yield from (record_note(e) for e in named if is_along_record(e.hypothesis))

@@ -18,6 +18,7 @@ from ident.held_out import not_fitted, with_held_out
 from ident.identification import identify
 from ident.leftover import find_leftover
 from ident.link_sensor import find_link_delays
+from ident.lost_samples import with_lost_samples_filled
 from ident.next_experiment import separating_experiment
 from ident.notes import chosen_motion_note, nameless_law
 from ident.parallel import Workers, one_thread_each
@@ -73,7 +74,8 @@ def diagnose_fully(
     began = time.perf_counter()
     workers = Workers(executor, progress, time.monotonic() + max_seconds)
     say = workers.say
-    given, dataset = dataset, with_held_out(dataset)
+    given, lost = with_lost_samples_filled(dataset)
+    dataset = with_held_out(given)
     doubts = [*unrepeated(given), *mislabelled(given)]
     if doubts:
         say("the recording looks mislabelled: no causes are sought")
@@ -101,6 +103,7 @@ def diagnose_fully(
             rigid=sought.rigid if result is sought.result or result.rounds else None,
             belied={r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)},
             tones=tones_of(sought.recorded, last),
+            lost=lost,
         )
     )
     left = None

@@ -16,6 +16,7 @@ from ident.estimate import ESTIMATORS, fit_frf
 from ident.frf import estimate_frf
 from ident.graybox import Parameters
 from ident.identification import identify
+from ident.lost_samples import with_lost_samples_filled
 from ident.outputs import outputs_into
 from ident.units import linear_names, parameter_unit
 from ident.values import baseline_values
@@ -34,6 +35,7 @@ def identify_and_write(
     Raises:
         DataError: for an estimator that there is not, or data without full FRFs.
     """
+    dataset, _ = with_lost_samples_filled(dataset)
     if estimator == "ml":
         _, result = identify(dataset, progress=progress)
         values, undetermined = baseline_values(result)

@@ -10,6 +10,7 @@ from ident.attribute import DETECTION_LEVEL, Attribution
 from ident.baseline import DETECTION_EXCESS
 from ident.chain import Structure
 from ident.hypotheses.hypothesis import RIPPLE
+from ident.lost_samples import LostSamples
 from ident.model import Effect
 from ident.noise import drifting
 from ident.problem import Problem
@@ -180,6 +181,16 @@ def tone_note(tone: Tone, joint: str) -> str:
     return (
         f"At {joint} the torque holds a tone near {tone.frequency_hz:.4g} Hz that does not repeat with the period of the excitation,"
         f" {tone.ratio:.3g} times the power of the noise there: something else shakes it, and counts as noise here."
+    )
+
+
+def lost_note(lost: LostSamples, joint: str) -> str:
+    """What was filled in the record of a position, in a sentence."""
+    if lost.every:
+        return f"{lost.channel} of {joint} has a new value every {lost.every} samples only: those between were filled by interpolation."
+    return (
+        f"Of {lost.channel} of {joint} {lost.share:.1%} of the samples repeat the one before, in motion: they were lost. They were filled"
+        " by interpolation, and nothing of the catalogue does that."
     )
 
 

@@ -67,7 +67,8 @@ def newton_euler(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> n
     Source: Luh, Walker and Paul, J. Dyn. Syst. Meas. Control 102 (1980), in frames of the joints.
     """
     q, v, a = (np.ascontiguousarray(x) for x in (q, v, a))
-    return recursion(*along_z(chain), q, *sines(q), v, a)
+    sine, cosine = sines(q)
+    return recursion(*along_z(chain), q, sine, cosine, v, a)
 
 
 def along_z(chain: Chain) -> ChainArrays:
