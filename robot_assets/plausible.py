@@ -6,10 +6,15 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
+from robot_assets.urdf import BOUNDLESS
+
 FARTHEST = 10.0  # m: a centre of mass or a joint, from the frame it is given in
 WIDEST = 3.0  # m: radius of gyration of a link
 TURNS = 4 * np.pi  # rad: limit of a turning joint
 MOMENTS = ("ixx", "iyy", "izz")
+PRODUCTS = ("ixy", "ixz", "iyz")
+EXCESS = 0.02  # of the largest moment, by which it may exceed the other two together: rounding in a file
+SLIGHT = 1e-5  # kg m2, the same: placeholders of links that weigh nothing
 
 
 def doubts(root: ET.Element) -> tuple[str, ...]:
@@ -36,7 +41,20 @@ def _of_link(link: ET.Element, name: str) -> list[str]:
         )
     elif m == 0 and largest > 1.0:
         out.append(f"the inertia of {name} is {largest:.3g} kg m2 without a mass")
+    a, b, c = _principal(tensor)
+    if c - a - b > max(EXCESS * c, SLIGHT):
+        out.append(
+            f"{name} has moments of inertia of {a:.3g}, {b:.3g} and {c:.3g} kg m2: of a body the largest is no more than the others together"
+        )
     return out
+
+
+def _principal(tensor: ET.Element | None) -> np.ndarray:
+    """(3,) moments of inertia, ascending."""
+    (xx, yy, zz), (xy, xz, yz) = (
+        [float("0" if tensor is None else tensor.get(k, "0")) for k in keys] for keys in (MOMENTS, PRODUCTS)
+    )
+    return np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _of_joint(joint: ET.Element, name: str) -> list[str]:
@@ -44,7 +62,8 @@ def _of_joint(joint: ET.Element, name: str) -> list[str]:
     limit = joint.find("limit")
     if joint.get("type") == "revolute":
         ends = [] if limit is None else [float(limit.get(k, "0")) for k in ("lower", "upper")]
-        if not ends or (limit is not None and not {"lower", "upper"} <= set(limit.keys())):
+        unsaid = limit is not None and not {"lower", "upper"} <= set(limit.keys())
+        if not ends or unsaid or not any(ends) or max(map(abs, ends)) > BOUNDLESS:
             out.append(f"{name} has no limits in the URDF: a turn is taken")
         elif max(map(abs, ends)) > TURNS:
             out.append(f"the limits of {name} are {ends[0]:g} to {ends[1]:g} rad: in degrees?")

@@ -16,8 +16,8 @@ MOVABLE = ("revolute", "continuous", "prismatic")
 SHORTEST = 1e-6  # of an axis
 MOST = 1000  # links, and joints
 NEGATIVE = 1e-3  # of the largest moment of inertia: what rounding in a file may leave below zero
-EXCESS = 0.02  # of the largest moment, by which it may exceed the other two together: rounding in a file
-SLIGHT = 1e-5  # kg m2, the same: placeholders of links that weigh nothing
+SLIGHT = 1e-7  # kg m2, the same: of links that hardly weigh anything
+BOUNDLESS = 1e6  # rad or m: a limit beyond stands for none
 LIMIT = {"lower": -np.pi, "upper": np.pi, "effort": 0.0, "velocity": 0.0}  # of a joint that says nothing of them
 MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 DEEPEST = 100  # elements inside elements: parsers of the engines recurse
@@ -200,8 +200,13 @@ def _limit(joint: ET.Element, name: str, path: Path) -> tuple[float, float]:
     limit = joint.find("limit")
     if limit is None or joint.get("type") == "continuous":
         return LIMIT["lower"], LIMIT["upper"]
-    low = _number(limit.get("lower", str(LIMIT["lower"])), f"lower limit of joint {name}", path)
-    high = _number(limit.get("upper", str(LIMIT["upper"])), f"upper limit of joint {name}", path)
+    low, high = (
+        _number(limit.get(end, str(LIMIT[end])), f"{end} limit of joint {name}", path, np.inf)
+        for end in ("lower", "upper")
+    )
+    if low == high == 0.0:  # as programs write it that know of none
+        return LIMIT["lower"], LIMIT["upper"]
+    low, high = (x if abs(x) <= BOUNDLESS else LIMIT[end] for x, end in ((low, "lower"), (high, "upper")))
     if low >= high:
         raise DataError(f"limit of joint {name}", str(path), f"{low:g} to {high:g}", "a lower limit below the upper")
     return low, high
@@ -218,15 +223,9 @@ def _check_inertial(inertial: ET.Element | None, link: str, path: Path) -> None:
         raise DataError(f"mass of link {link}", str(path), str(mass.get("value")), "at least zero")
     xx, yy, zz, xy, xz, yz = (_number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in MOMENTS)
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if moments.min() < -NEGATIVE * np.abs(moments).max():
+    if moments.min() < -max(NEGATIVE * np.abs(moments).max(), SLIGHT):
         raise DataError(
             f"inertia of link {link}", str(path), f"a moment of {moments.min():.3g} kg m2", "moments of at least zero"
-        )
-    a, b, c = moments
-    if c - a - b > max(EXCESS * c, SLIGHT):
-        found = f"moments of {a:.3g}, {b:.3g} and {c:.3g} kg m2"
-        raise DataError(
-            f"inertia of link {link}", str(path), found, "none larger than the other two together, as of any body"
         )
 
 
@@ -242,11 +241,11 @@ def _vector(element: ET.Element | None, key: str, what: str, path: Path, default
     return [_number(word, what, path) for word in words]
 
 
-def _number(word: str | None, what: str, path: Path) -> float:
+def _number(word: str | None, what: str, path: Path, most: float = LARGEST) -> float:
     try:
         value = float(str(word))
     except ValueError:
         value = np.nan
-    if not abs(value) <= LARGEST:
-        raise DataError(what, str(path), repr(word), f"a number of at most {LARGEST:g}")
+    if not abs(value) <= most:
+        raise DataError(what, str(path), repr(word), f"a number of at most {most:g}")
     return value

@@ -190,7 +190,8 @@ BODY = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="
         (-3, (0.1, 0.1, 0.1, 0), "", "mass of link b"),
         (3, (0.1, 0.1, -0.1, 0), "", "a moment of -0.1 kg m2"),
         (3, (0.1, 0.1, 0.1, 0.2), "", "a moment of -0.1 kg m2"),
-        (3, (0.1, 0.1, 0.3, 0), "", "moments of 0.1, 0.1 and 0.3 kg m2"),
+        (3, (0.1, 0.1, 0.3, 0), "", None),  # told as hardly so
+        (3, (1e-9, 0, -3e-8, 0), "", None),
         (3, (0.1, 0.1, 0.1, 0.04), "", None),
         (3, (0.1, 0.1, 0.1, 0), '<mimic joint="one"/>', "found itself"),
         (3, (0.1, 0.1, 0.1, 0), '<mimic joint="two"/>', "a joint of the URDF"),

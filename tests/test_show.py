@@ -78,9 +78,10 @@ def with_moments(folder, moments):
     return load_robot(folder)
 
 
-@pytest.mark.parametrize("largest", [1.8, 1.82])
+@pytest.mark.parametrize("largest", [1.8, 1.82, 2.6])
 def test_flat_links_are_exported_and_simulated(tmp_path, largest):
-    """The largest moment of inertia of a flat body is the sum of the others, which the digits of a file pass."""
+    """The largest moment of inertia of a flat body is the sum of the others, which the digits of a file pass, and some
+    files by far: their nearest body is simulated."""
     robot = with_moments(tmp_path, [0.7, 1.1, largest])
     spec = build_mjcf(robot, parameters(robot))
     spec.compile()

@@ -78,6 +78,17 @@ def test_what_no_robot_can_be_made_of_names_the_urdf_and_the_joint(tmp_path, old
             'lower="-170" upper="170"',
             "the limits of joint wrist are -170 to 170 rad: in degrees?",
         ),
+        (
+            UPPER,
+            '<mass value="3"/><inertia ixx="0.1" iyy="0.1" izz="0.3"/>',
+            "link upper has moments of inertia of 0.1, 0.1 and 0.3 kg m2: of a body the largest is no more than the others together",
+        ),
+        ('lower="-1" upper="1"', 'lower="0" upper="0.0"', "joint wrist has no limits in the URDF: a turn is taken"),
+        (
+            'lower="-1" upper="1"',
+            'lower="-1e16" upper="inf"',
+            "joint wrist has no limits in the URDF: a turn is taken",
+        ),
         ('lower="-1" upper="1"', "", "joint wrist has no limits in the URDF: a turn is taken"),
         ('effort="20"', 'effort="many"', "effort of joint wrist is 'many', which is no limit: one is guessed"),
         ('velocity="3"', 'velocity="-3"', "velocity of joint shoulder is '-3', which is no limit: one is guessed"),
