@@ -24,7 +24,7 @@ from ident.notes import chosen_motion_note, nameless_law
 from ident.parallel import Workers, one_thread_each
 from ident.period_checks import unrepeated
 from ident.problem import predictions
-from ident.refuted import HeldOut, held_out, taken_back
+from ident.refuted import HeldOut, held_out, taken_back, without_denied
 from ident.reporting import affected_joints, evidence_plot, frf_views, spectrum_map, torque_traces
 from ident.seek import Sought, seek
 from ident.tones import Tone, find_tones
@@ -156,7 +156,9 @@ def tested(
         renewed = inertias and sought.rigid is not None
         return held_out(sought.setup, sought.nominal, baseline, found, renewed, affected, method, workers)
 
-    result, test, notes = taken_back(sought.setup, sought.result, of_model)
+    result, denied_lines = without_denied(sought.setup, sought.result)
+    result, test, lines = taken_back(sought.setup, result, of_model)
+    notes = [*denied_lines, *lines]
     if test.told_by_torque:
         notes.append(chosen_motion_note(test.told_by_torque))
     return result, test, notes

@@ -15,10 +15,10 @@ from ident.group import Group
 from ident.identification import Setup
 from ident.left_out import SEED, joined, refitted
 from ident.parallel import Workers
-from ident.problem import NOT_COMPUTED
+from ident.problem import NOT_COMPUTED, Problem
 from ident.pruning import without_effect
 from ident.torque_fit import Fit
-from ident.trust import fails_held_out, is_halved
+from ident.trust import denied, fails_held_out, is_halved
 from ident.units import torque_unit, units_of_torques
 from ident.values import named_effects
 from ident.verdict import LEFT_OUT, Gain
@@ -115,6 +115,34 @@ def leave_one_out(
     return joined(workers.map(without, points))
 
 
+def without_denied(setup: Setup, result: Attribution) -> tuple[Attribution, list[str]]:
+    """A result without the causes, found within the noise beside others, that held-out data deny (``trust.denied``),
+    and a line on each.
+
+    A cause that stands alone stays: something was seen, and it is not that.
+    """
+    lines = []
+    for found in result.rounds:
+        cause = found.candidates[0].hypothesis
+        named = {e.hypothesis.key for e in named_effects(result.final)}
+        if cause.key not in named or len(named) < 2 or not denied(setup.problem, setup.held_out, found):
+            continue
+        try:
+            result = _without(setup.problem, result, cause.key)
+        except NOT_COMPUTED:
+            continue
+        lines.append(
+            f"Taken back: {cause.effect} at {cause.place}, found within the noise. What it changes there does not show in held-out data."
+        )
+    return result, lines
+
+
+def _without(problem: Problem, result: Attribution, key: tuple[str, str]) -> Attribution:
+    """A result without one of its causes, the others fitted again."""
+    rounds = tuple(r for r in result.rounds if r.candidates[0].hypothesis.key != key)
+    return replace(result, final=without_effect(problem, result.final, key), rounds=rounds)
+
+
 def taken_back(
     setup: Setup, result: Attribution, tested: Callable[[Attribution, bool], HeldOut]
 ) -> tuple[Attribution, HeldOut, list[str]]:
@@ -145,9 +173,8 @@ def taken_back(
         if not refuted or len(found) < 2:
             break
         last = found[-1]
-        rounds = tuple(r for r in result.rounds if r.candidates[0].hypothesis.key != last.key)
         try:
-            less = replace(result, final=without_effect(problem, result.final, last.key), rounds=rounds)
+            less = _without(problem, result, last.key)
             other = tested(less, True)
         except NOT_COMPUTED:
             break

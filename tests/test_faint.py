@@ -19,6 +19,7 @@ from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
 from ident.notes import drift_note
 from ident.problem import predictions
 from ident.refits import refit
+from ident.refuted import without_denied
 from ident.rounds import Round, temper_of, told_share, weighed_round
 from ident.screening import Score
 from ident.search import hopeful
@@ -383,6 +384,25 @@ def test_a_diagnosis_asks_held_out_data_about_its_causes(clean, identified, hypo
     verdict = diagnose(clean[0])
     assert asked == [(setup.held_out, found)]
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
+
+
+def test_denied_causes_are_taken_back_where_others_stand(identified, hypotheses, monkeypatch):
+    """The last that stands stays, as something was seen."""
+    _, setup, baseline = identified
+    late, off = (
+        next(h for h in hypotheses if h.key == (name, "elbow_joint"))
+        for name in ("torque_delay", "encoder_eccentricity")
+    )
+    effects = (Effect(late, np.array([1e-5])), Effect(off, np.array([1e-4, 0.0])))
+    final = refit(setup.problem, replace(baseline.model, effects=effects), baseline.weights, baseline.remainders)
+    rounds = tuple(Round(baseline, (Candidate(h, final, 0.0, 1.0),), (), 1.0, 1.0) for h in (late, off))
+    found = Attribution(baseline, True, False, 0.0, rounds, final, False)
+    monkeypatch.setattr("ident.refuted.denied", lambda problem, groups, of: of.candidates[0].hypothesis is off)
+    left, (line,) = without_denied(setup, found)
+    assert [e.hypothesis for e in left.final.model.effects] == [late] and left.rounds == rounds[:1]
+    assert "encoder_eccentricity at elbow_joint" in line
+    alone = replace(found, rounds=rounds[1:], final=replace(final, model=replace(final.model, effects=effects[1:])))
+    assert without_denied(setup, alone) == (alone, [])
 
 
 @pytest.mark.parametrize("clear", [True, False])
