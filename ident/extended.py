@@ -164,9 +164,13 @@ def predict_at(
         by_channel.setdefault(effect.hypothesis.channel, []).append(effect)
     for effect in by_channel.get("position", []):
         j = effect.hypothesis.joint
-        bare = Solution(Q, Q, Q, Q, Q, Q, Q, Torques())
+        seen = Motion(group, Solution(Q, Q, Q, Q, Q, Q, Q, Torques()), par)
+        error = effect.hypothesis.law(effect.p, seen, j, par.stiffness[j])
+        # Laws see the motion without lines of noise, which they pass on with their slope nonetheless: a model in which
+        # they did not would gain by another inertia that leaves less of that noise.
+        passed_on = (_position_slopes(seen, [effect])[j] - 1.0) * seen.unseen(j)
         Q = Q.copy()
-        Q[..., j] += effect.hypothesis.law(effect.p, Motion(group, bare, par), j, par.stiffness[j])
+        Q[..., j] += error + passed_on
     inner = by_channel.get("link", []) + by_channel.get("spring", [])
     motor = by_channel.get("motor", [])
     along = joints_along_record(model, group)

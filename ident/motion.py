@@ -122,6 +122,10 @@ class Motion(Recorded):
         fast = 0.0 if self.group.fast_velocity is None else self.group.fast_velocity[..., joint]
         return self.kept(("v", joint), lambda: self._shown(joint, 1) + fast)
 
+    def unseen(self, joint: int) -> np.ndarray:
+        """Spectrum (S, L) of the motor position that laws are not shown: its noise, rad."""
+        return (1.0 - self.group.signal_share[..., joint]) * self.solution.Q[..., joint]
+
     def acceleration(self, joint: int) -> np.ndarray:
         """Motor acceleration, rad/s2."""
         return self._time(self.solution.Q, joint, 2)

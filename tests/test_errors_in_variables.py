@@ -207,3 +207,21 @@ def test_an_effect_that_the_data_do_not_feel_is_no_candidate(identified):
     )
     model = replace(result.model, effects=(Effect(h, np.array([1e6, 0.03])),))
     assert refit(setup.problem, model, result.weights, result.remainders, 1) is None
+
+
+@pytest.mark.parametrize("law", [ECCENTRIC, ("unknown:position_scale", 1.1), ("sensor_lag", 1e-3, 0.0)])
+def test_an_encoder_passes_on_the_noise_that_its_law_is_not_shown(identified, law):
+    """With its slope, as the noise of the model has it. Where it did not another inertia would leave less of it, and
+    noise alone would name an encoder out of centre."""
+    _, setup, first = identified
+    problem, group = setup.problem, setup.problem.groups[0]
+    model = with_effects(first.model, law)
+    j = model.effects[-1].hypothesis.joint
+    hidden = np.all(group.signal_share[..., j] == 0.0, axis=0)
+    assert 10 < hidden.sum() < len(hidden)
+    less = replace(group, Q=group.Q * ~(hidden[:, None] & (np.arange(problem.structure.n) == j)))
+    whole, silent = (predict(model, g, problem.sampling, W=first.remainders[0], steps=0) for g in (group, less))
+    expected = np.einsum("li,sl->sli", whole.sampled_impedance[..., j], group.Q[..., j])
+    found = whole.outputs() - silent.outputs()
+    assert np.abs(found - expected)[:, hidden].max() < 0.02 * np.abs(expected[:, hidden]).max()
+    assert np.abs(found[:, ~hidden]).max() < 0.02 * np.abs(found[:, hidden]).max()

@@ -88,8 +88,12 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         return 1.0 / (1.0 + turns * (p[0] * np.cos(turns * q) - p[1] * np.sin(turns * q)))
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
-        q = turns * motion.q(j)
-        return Screen((-motion.lines(np.sin(q)), -motion.lines(np.cos(q))), lambda c: np.array(c))
+        q, unseen = turns * motion.q(j), turns * motion.unseen(j)
+        sine, cosine = np.sin(q), np.cos(q)
+        return Screen(
+            (-motion.lines(sine) - np.mean(cosine) * unseen, -motion.lines(cosine) + np.mean(sine) * unseen),
+            lambda c: np.array(c),
+        )
 
     return Hypothesis(
         "encoder_eccentricity",
@@ -115,7 +119,7 @@ def position_scale(joint: int, place: str) -> Hypothesis:
     that is out of centre does nearly that where it turns little."""
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        return (1.0 / p[0] - 1.0) * motion.lines(motion.q(j))
+        return (1.0 / p[0] - 1.0) * motion.solution.Q[..., j]
 
     return Hypothesis(
         "unknown:position_scale",
@@ -125,7 +129,7 @@ def position_scale(joint: int, place: str) -> Hypothesis:
         (SCALE,),
         law,
         lambda scale: [()],
-        lambda motion, j, k, shape: Screen((-motion.lines(motion.q(j)),), lambda c: np.array([scale_of(-c[0])])),
+        lambda motion, j, k, shape: Screen((-motion.solution.Q[..., j],), lambda c: np.array([scale_of(-c[0])])),
         "The position of {joint} is recorded {scale:.4g} times as large as it is.",
         variable="q",
         options={"filter": lambda p, s: np.full(len(s), 1.0 / p[0])},
