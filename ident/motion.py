@@ -155,9 +155,13 @@ class Motion(Recorded):
         return self._asked(joint)[0]
 
     def asked_noise(self, joint: int) -> float:
-        """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean
-        over records."""
+        """Standard deviation that noise of the samples of motor position and torque leaves in what is asked, N m; in
+        the mean over records."""
         return self._asked(joint)[1]
+
+    def asked_noise_whole(self, joint: int) -> float:
+        """The same with the lines of noise alone, which are not asked."""
+        return float(np.sqrt(2.0 * np.sum(self._noise_of_lines(joint))))
 
     def _asked(self, joint: int) -> tuple[np.ndarray, float]:
         if joint not in self.asked_of:
