@@ -101,7 +101,7 @@ class Motion(Recorded):
     error: np.ndarray | float = 0.0
     delivered: np.ndarray | None = None
     told: frozenset[int] = frozenset()
-    asked_of: dict[int, tuple[np.ndarray, float]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    asked_of: dict[int, np.ndarray] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
         """A signal (S, T) of the solution, which is made once: laws ask for it again with every step of their
@@ -152,23 +152,11 @@ class Motion(Recorded):
 
     def asked(self, joint: int) -> np.ndarray:
         """Torque that the record leaves to a friction of the motor, N m."""
-        return self._asked(joint)[0]
-
-    def asked_noise(self, joint: int) -> float:
-        """Standard deviation that noise of the samples of motor position and torque leaves in what is asked, N m; in
-        the mean over records."""
-        return self._asked(joint)[1]
-
-    def asked_noise_whole(self, joint: int) -> float:
-        """The same with the lines of noise alone, which are not asked."""
-        return float(np.sqrt(2.0 * np.sum(self._noise_of_lines(joint))))
-
-    def _asked(self, joint: int) -> tuple[np.ndarray, float]:
         if joint not in self.asked_of:
-            self.asked_of[joint] = self._asked_and_noise(joint)
+            self.asked_of[joint] = self._asked(joint)
         return self.asked_of[joint]
 
-    def _asked_and_noise(self, joint: int) -> tuple[np.ndarray, float]:
+    def _asked(self, joint: int) -> np.ndarray:
         rate, square = differences(1j * self.group.omega, self.group.steps)
         x = self.solution
         linear = (square * rotor_inertia(self.par, self.group.steps)[joint] + rate * self.par.viscous[joint]) * x.Q[
@@ -179,13 +167,16 @@ class Motion(Recorded):
         given = self.group.U if self.delivered is None else self.delivered
         left = given[..., joint] - linear - carried - others
         # What is cut off at the size of a friction mixes the noise of fast lines, where it is largest, into all.
-        noise = self._noise_of_lines(joint)
-        share = signal_share(left, noise)
-        kept = np.mean(np.sum(share**2 * noise, axis=1))
-        return self.group.to_time((share * left)[..., None])[..., 0], float(np.sqrt(2.0 * kept))
+        left = signal_share(left, self._asked_noise(joint)) * left
+        return self.group.to_time(left[..., None])[..., 0]
 
-    def _noise_of_lines(self, joint: int) -> np.ndarray:
-        """(L,) variance of the torque of a motor by noise of the samples of its position and torque, N2 m2."""
+    def asked_noise(self, joint: int) -> float:
+        """Standard deviation of what is asked by noise of the samples of motor position and torque, N m; in the mean
+        over records."""
+        return float(np.sqrt(2.0 * np.sum(self._asked_noise(joint))))
+
+    def _asked_noise(self, joint: int) -> np.ndarray:
+        """(L,) its variance, N2 m2."""
         group, s = self.group, 1j * self.group.omega
         gain = np.abs(s**2 * self.par.inertia[joint] + s * self.par.viscous[joint]) ** 2
         return (gain * group.white_noise[joint] + group.white_torque_noise[joint]) * np.mean(1.0 / group.periods)

@@ -103,8 +103,7 @@ def dry(
     if largest < SEEN * motion.asked_noise(j):
         return moving
     asked, least, most = motion.asked(j), -np.abs(back), np.abs(size)
-    # Events that lines do not resolve make more of it than noise of the lines that are asked does.
-    noise = motion.asked_noise_whole(j)
+    noise = motion.asked_noise(j)
     friction = np.where(rest, within(asked, least, most, noise), moving)
     # Of what is asked only some lines are known, and its jumps ring: what has these lines within the limits is sought,
     # by projection onto one and the other in turn (Papoulis 1975).
