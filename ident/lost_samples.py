@@ -51,7 +51,7 @@ def with_lost_samples_filled(dataset: Dataset) -> tuple[Dataset, tuple[LostSampl
                 for k, s in enumerate(dataset.segments)
                 if (x := getattr(s, channel)) is not None and np.all(np.isfinite(x[:, j]))
             }
-            lost = {k: repeated(x) for k, x in records.items()}
+            lost = {k: repeated(x) & ~_row_again(dataset.segments[k].tau[:, j]) for k, x in records.items()}
             whole, count = sum(map(len, records.values())), sum(int(np.sum(at)) for at in lost.values())
             if count < FEWEST or count < LEAST * whole:
                 continue
@@ -110,6 +110,12 @@ def resolution(step: np.ndarray) -> float:
     counts = size / size.min()
     whole = np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95
     return float(size.min()) if whole else 0.0
+
+
+def _row_again(tau: np.ndarray) -> np.ndarray:
+    """(N,) samples whose torque is that of the one before too: a row of the log that came twice, in which torque and
+    position still go together."""
+    return np.concatenate([[False], tau[1:] == tau[:-1]])
 
 
 def _clock(lost: list[np.ndarray]) -> int:

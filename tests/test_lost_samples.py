@@ -90,9 +90,14 @@ def test_a_slower_clock_is_none_that_loses(clean):
         assert np.array_equal(s.q[:, 0], before.q[:, 0])
 
 
-def test_whole_datasets_stay_as_they_are(clean):
-    same, found = with_lost_samples_filled(clean[0])
-    assert same is clean[0] and found == ()
+def test_whole_datasets_and_rows_that_came_twice_stay_as_they_are(clean):
+    """A log that is faster than what it records is late in torque and position alike."""
+    again = [
+        replace(s, **{c: getattr(s, c)[np.arange(len(s.t)) // 2 * 2] for c in ("q", "tau")}) for s in clean[0].segments
+    ]
+    for data in (clean[0], replace(clean[0], segments=tuple(again))):
+        same, found = with_lost_samples_filled(data)
+        assert same is data and found == ()
 
 
 def test_lost_samples_are_an_unknown_cause_and_no_delay(tmp_path):
