@@ -13,8 +13,7 @@ import scipy.signal
 from ident.chain import build_structure
 from ident.dataset import Dataset, Segment
 from ident.lost_samples import CHANNELS as REPEATED
-from ident.lost_samples import repeated as repeated_samples
-from ident.lost_samples import resolution
+from ident.lost_samples import lost_among, resolution
 from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
@@ -229,7 +228,9 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
     for channel in REPEATED:
         x = getattr(s, channel)
         for j, name in enumerate(dataset.joints if x is not None else ()):
-            share = float(np.mean(repeated_samples(x[:, j]) & ~together))
+            if not np.all(np.isfinite(x[:, j])):
+                continue
+            share = float(np.mean(lost_among([x[:, j]])[0][0] & ~together))
             if share > 0.0:
                 out.append(
                     f"{channel}_{j + 1} ({name}): {share:.1%} of the samples repeat the one before, in motion: lost samples"

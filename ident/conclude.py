@@ -226,7 +226,7 @@ def places(found: Findings, tones: Sequence[Tone]) -> Iterator[Where]:
         yield Where(joints[tone.joint], "tau", f"a tone at {tone.frequency_hz:.4g} Hz", 1.0)
     for lag in found.late:
         yield Where(joints[lag.joint], "q_link", "position that follows the velocity", 1.0)
-    for lost in found.lost:
+    for lost in (x for x in found.lost if not x.every):
         yield Where(joints[lost.joint], lost.channel, "samples that repeat the one before", 1.0)
 
 

@@ -7,6 +7,7 @@ and is back on its way one sample later.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +19,16 @@ from ident.dataset import Dataset
 CHANNELS = ("q", "q_link")
 STANDS_OUT = 4.0  # error of a repeated value over that of a straight line between its neighbours elsewhere
 USUAL = 90.0  # percentile of the latter
-STEPS, NEAR = 1.5, 33  # change after a repeated value over the least of as many near by, which may be an encoder's step
+COUNTS = 2.0  # the same error over the count of an encoder
+STEPS, NEAR = 1.5, 33  # change after a repeated value over the least of as many near by, which may be a count
 CAUGHT_UP = 0.5  # difference, relative, of the speed over repeated values from those before and after
 LONGEST = 20  # samples: where more are alike a joint rests, or the log froze
-FEWEST, LEAST = 5, 1e-3  # such samples at a joint from which any were lost, and their share
-REGULAR = 0.8  # share of the values that are repeated as often as most, from which a slower clock is what repeats them
+FEWEST, LEAST = 5, 1e-3  # such samples of a joint from which any were lost, and their share
+REGULAR = 0.8  # share of the values that stand as long as most, or a multiple of it, where a slower clock repeats them
+ROWS = 0.9  # share of the repeated values that come with all torques repeated, from which rows of the log came twice
 DEGREE = 5  # of the spline that fills them
+MOST_COUNTS = 5  # of an encoder in the smallest step of a record
+WHOLE, MOSTLY = 0.02, 0.95  # distance from whole counts, of that share of the steps
 
 
 @dataclass(frozen=True)
@@ -42,87 +47,120 @@ class LostSamples:
 
 
 def with_lost_samples_filled(dataset: Dataset) -> tuple[Dataset, tuple[LostSamples, ...]]:
-    """A dataset in which such samples follow from those about them, and what was filled."""
+    """A dataset in which such samples follow from those about them, and what was filled.
+
+    Not where rows of the log came twice: torque and position still go together there.
+    """
     found = []
     for channel in CHANNELS:
         for j in range(dataset.n):
-            records = {
-                k: x[:, j]
+            at = [
+                k
                 for k, s in enumerate(dataset.segments)
                 if (x := getattr(s, channel)) is not None and np.all(np.isfinite(x[:, j]))
-            }
-            lost = {k: repeated(x) & ~_row_again(dataset.segments[k].tau[:, j]) for k, x in records.items()}
-            whole, count = sum(map(len, records.values())), sum(int(np.sum(at)) for at in lost.values())
-            if count < FEWEST or count < LEAST * whole:
+            ]
+            records = [getattr(dataset.segments[k], channel)[:, j] for k in at]
+            lost, every = lost_among(records)
+            count = sum(int(np.sum(x)) for x in lost)
+            twice = sum(int(np.sum(x & _row_again(dataset.segments[k].tau))) for k, x in zip(at, lost, strict=True))
+            if not count or twice > ROWS * count:
                 continue
-            found.append(LostSamples(j, channel, count / whole, _clock(list(lost.values()))))
-            for k, at in lost.items():
-                dataset = _with(dataset, k, channel, j, filled(records[k], at))
+            found.append(LostSamples(j, channel, count / sum(map(len, records)), every))
+            for k, x, gone in zip(at, records, lost, strict=True):
+                dataset = _with(dataset, k, channel, j, filled(x, gone))
     return dataset, tuple(found)
 
 
-def repeated(x: np.ndarray) -> np.ndarray:
-    """(N,) samples that repeat the one before, where the motion about them does not stop."""
+def lost_among(records: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
+    """Samples of the records of one signal, (N,) each, that repeat the one before where the motion about them does not
+    stop; and ``LostSamples.every``."""
+    runs = [_runs(x) for x in records]
+    whole, step = sum(map(len, records)), np.concatenate([np.abs(np.diff(r.values)) for r in runs] or [np.empty(0)])
+    count = resolution(step)
+    if sum(_clear(r, count) for r in runs) < max(FEWEST, LEAST * whole):
+        return [np.zeros(len(x), bool) for x in records], 0
+    lengths = np.concatenate([r.lengths[r.lengths <= LONGEST] for r in runs])
+    usual = int(np.median(lengths))
+    clocked = usual > 1 and np.mean(lengths % usual == 0) > REGULAR
+    return [_repeats(r, count) for r in runs], usual if clocked else 0
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Runs of equal values of a signal: their values, where they start, and how many samples they last."""
+
+    values: np.ndarray
+    starts: np.ndarray
+    lengths: np.ndarray
+
+
+def _runs(x: np.ndarray) -> _Runs:
     starts = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1])
-    lengths = np.diff(np.concatenate([starts, [len(x)]]))
-    none = np.zeros(len(x), bool)
-    if len(starts) < 4 or np.all(lengths == 1):
-        return none
-    values, between = x[starts], np.diff(starts)
-    slope = np.diff(values) / between
+    return _Runs(x[starts], starts, np.diff(np.concatenate([starts, [len(x)]])))
+
+
+def _clear(runs: _Runs, count: float) -> int:
+    """Repeated samples that no motion explains.
+
+    Args:
+        count: of the encoder; 0 where it has none that shows.
+    """
+    between = runs.lengths[:-1]
+    if len(between) < 3 or np.all(between == 1):
+        return 0
+    slope = np.diff(runs.values) / between
     # What a straight line between the neighbours of a value misses, where nothing is lost or all the same.
     bend = np.abs(slope[1:] - slope[:-1]) * between[1:] * between[:-1] / (between[1:] + between[:-1])
-    missed = np.abs(slope) * (lengths[:-1] - 1)
-    steps = np.abs(np.diff(values))
-    short = (lengths > 1) & (lengths <= LONGEST)
-    runs = short[:-1] & (steps > STEPS * minimum_filter1d(steps, NEAR))
+    missed, step = np.abs(slope) * (between - 1), np.abs(np.diff(runs.values))
     # Once it has a new value the joint is where it would be at its speed before and after: it has not paused.
-    caught_up = np.zeros(len(slope), bool)
-    off = np.abs(np.diff(slope))
+    caught_up, off = np.zeros(len(slope), bool), np.abs(np.diff(slope))
     caught_up[1:-1] = np.maximum(off[1:], off[:-1]) < CAUGHT_UP * np.abs(slope[1:-1])
-    clear = runs & caught_up & (missed > STANDS_OUT * np.percentile(bend, USUAL))
-    if np.sum((lengths[:-1] - 1)[clear]) < max(FEWEST, LEAST * len(x)):
-        return none
-    # Slow motion repeats values by the steps of an encoder alone.
-    again = np.repeat(np.append(runs, False) if resolution(steps) else short, lengths)
-    again[starts] = False
+    short = (between > 1) & (between <= LONGEST) & (step > STEPS * minimum_filter1d(step, NEAR))
+    clear = short & caught_up & (missed > max(STANDS_OUT * np.percentile(bend, USUAL), COUNTS * count))
+    return int(np.sum((between - 1)[clear]))
+
+
+def _repeats(runs: _Runs, count: float) -> np.ndarray:
+    """(N,) samples that repeat the one before, of an encoder with counts those alone after which it skips some: slow
+    motion repeats the others."""
+    short = (runs.lengths > 1) & (runs.lengths <= LONGEST)
+    if count:
+        short &= np.append(np.abs(np.diff(runs.values)) > STEPS * count, False)
+    again = np.repeat(short, runs.lengths)
+    again[runs.starts] = False
     return again
 
 
 def filled(x: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """A signal (N,) with the samples that were lost told by the others."""
+    """A signal (N,) with the samples that were lost told by the others; on the counts of its encoder, if it has any."""
     kept, gone = np.flatnonzero(~lost), np.flatnonzero(lost)
     if not len(gone) or len(kept) <= DEGREE:
         return x
     out = x.copy()
     out[gone] = make_interp_spline(kept, x[kept], DEGREE)(np.minimum(gone, kept[-1]))
     out[gone] += np.maximum(gone - kept[-1], 0) * (x[kept[-1]] - x[kept[-2]]) / (kept[-1] - kept[-2])
+    if count := resolution(np.diff(x)):
+        out[gone] = x[kept[0]] + count * np.round((out[gone] - x[kept[0]]) / count)
     return out
 
 
 def resolution(step: np.ndarray) -> float:
-    """The smallest of some steps that is no rounding error, where the others are multiples of it: the count of an
-    encoder; else 0."""
-    size = np.abs(step[step != 0])
+    """The count of an encoder: the smallest of some steps that is no rounding error, or a small fraction of it, where
+    the others are multiples of that; else 0."""
+    size = np.abs(step[(step != 0) & np.isfinite(step)])
     if not len(size):
         return 0.0
     size = size[size > 1e-9 * size.max()]
-    counts = size / size.min()
-    whole = np.mean(np.abs(counts - np.round(counts)) < 0.02) > 0.95
-    return float(size.min()) if whole else 0.0
+    for parts in range(1, MOST_COUNTS + 1):
+        counts = parts * size / size.min()
+        if np.mean(np.abs(counts - np.round(counts)) < WHOLE) > MOSTLY:
+            return float(size.min()) / parts
+    return 0.0
 
 
 def _row_again(tau: np.ndarray) -> np.ndarray:
-    """(N,) samples whose torque is that of the one before too: a row of the log that came twice, in which torque and
-    position still go together."""
-    return np.concatenate([[False], tau[1:] == tau[:-1]])
-
-
-def _clock(lost: list[np.ndarray]) -> int:
-    """Samples between new values where most are as far apart; else 0."""
-    apart = np.concatenate([np.diff(np.flatnonzero(~at)) for at in lost])
-    usual = int(np.median(apart))
-    return usual if usual > 1 and np.mean(apart == usual) > REGULAR else 0
+    """(N,) samples whose torques (N, n) are all those of the one before too."""
+    return np.concatenate([[False], np.all(tau[1:] == tau[:-1], axis=1)])
 
 
 def _with(dataset: Dataset, segment: int, channel: str, joint: int, x: np.ndarray) -> Dataset:

@@ -105,16 +105,17 @@ def sines(angle):
     """Sine and cosine of a contiguous array of angles, rad, together: without branches, so that processors take several
     angles at once.
 
-    To one unit in the last place where angles are below a million turns. Polynomials between -pi/4 and pi/4 of FreeBSD's
-    ``k_sin.c`` and ``k_cos.c`` (Sun Microsystems, 1993), and pi/2 in two parts (Cody and Waite, Software Manual for the
-    Elementary Functions, 1980).
+    To one unit in the last place of one where angles are below 100,000 turns. Polynomials between -pi/4 and pi/4 and the
+    three parts of pi/2, of which the first two have 33 bits, of FreeBSD's ``k_sin.c``, ``k_cos.c`` and ``e_rem_pio2.c``
+    (Sun Microsystems, 1993).
     """
     flat = angle.ravel()
     sine, cosine = np.empty(flat.size), np.empty(flat.size)
     for i in range(flat.size):
         quarters = np.rint(flat[i] * (2.0 / np.pi))
-        x = flat[i] - quarters * 1.5707963267948966
-        x -= quarters * 6.123233995736766e-17
+        x = flat[i] - quarters * 1.57079632673412561417e00
+        x -= quarters * 6.07710050630396597660e-11
+        x -= quarters * 2.02226624879595063154e-21
         z = x * x
         tail = -1.98412698298579493134e-04 + z * (
             2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)

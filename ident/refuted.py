@@ -122,7 +122,7 @@ def without_denied(setup: Setup, result: Attribution) -> tuple[Attribution, list
     A cause that stands alone stays: something was seen, and it is not that.
     """
     lines = []
-    for found in result.rounds:
+    for found in reversed(result.rounds):
         cause = found.candidates[0].hypothesis
         named = {e.hypothesis.key for e in named_effects(result.final)}
         if cause.key not in named or len(named) < 2 or not denied(setup.problem, setup.held_out, found):

@@ -77,12 +77,12 @@ def seek(
     recorded = setup.problem.groups
     linked = None if mislabelled else by_link_encoders(dataset, setup, baseline, max_causes, workers)
     if linked is not None and explained(linked.result):
-        return linked
+        return replace(linked, late=workers.late)
     foretell = not mislabelled and setup.problem.motions_alone and inertias_foretell(setup)
     first_search = workers.for_half() if foretell else workers  # causes are then sought beside these inertias too
     setup, baseline, result = sought(dataset, setup, baseline, max_causes, first_search)
     if linked is not None and linked.result.detected and not result.detected:
-        return replace(linked, late=first_search.late)
+        return replace(linked, late=linked.late or first_search.late)
     found = Sought(setup, recorded, baseline, result, setup.problem.nominal, late=first_search.late)
     if foretell and unresolved(result) and not workers.late:
         return with_inertias(found, max_causes, workers)

@@ -63,8 +63,10 @@ def _of_joint(joint: ET.Element, name: str) -> list[str]:
     if joint.get("type") == "revolute":
         ends = [] if limit is None else [float(limit.get(k, "0")) for k in ("lower", "upper")]
         unsaid = limit is not None and not {"lower", "upper"} <= set(limit.keys())
-        if not ends or unsaid or not any(ends) or max(map(abs, ends)) > BOUNDLESS:
+        if not ends or unsaid or not any(ends) or min(map(abs, ends)) > BOUNDLESS:
             out.append(f"{name} has no limits in the URDF: a turn is taken")
+        elif max(map(abs, ends)) > BOUNDLESS:
+            out.append(f"{name} has a limit to one side alone in the URDF: a turn or more is taken")
         elif max(map(abs, ends)) > TURNS:
             out.append(f"the limits of {name} are {ends[0]:g} to {ends[1]:g} rad: in degrees?")
     for key in ("effort", "velocity"):

@@ -185,7 +185,10 @@ def completed(path: Path) -> str:
     for joint in root.iter("joint"):
         if joint.get("type") in ("revolute", "prismatic"):
             limit = joint.find("limit")
-            _complete(ET.SubElement(joint, "limit") if limit is None else limit, LIMIT)
+            low, high = _limit(joint, str(joint.get("name")), path)
+            limit = ET.SubElement(joint, "limit") if limit is None else limit
+            limit.attrib |= {"lower": repr(low), "upper": repr(high)}
+            _complete(limit, LIMIT)
     for tensor in root.iter("inertia"):
         _complete(tensor, dict.fromkeys(MOMENTS, 0.0))
     return ET.tostring(root, encoding="unicode")
@@ -204,9 +207,13 @@ def _limit(joint: ET.Element, name: str, path: Path) -> tuple[float, float]:
         _number(limit.get(end, str(LIMIT[end])), f"{end} limit of joint {name}", path, np.inf)
         for end in ("lower", "upper")
     )
-    if low == high == 0.0:  # as programs write it that know of none
+    if low == high == 0.0 and joint.get("type") == "revolute":  # as programs write it that know of none
         return LIMIT["lower"], LIMIT["upper"]
-    low, high = (x if abs(x) <= BOUNDLESS else LIMIT[end] for x, end in ((low, "lower"), (high, "upper")))
+    open_low, open_high = low < -BOUNDLESS, high > BOUNDLESS
+    if open_low:
+        low = LIMIT["lower"] if open_high else min(LIMIT["lower"], high - 2.0 * np.pi)
+    if open_high:
+        high = LIMIT["upper"] if open_low else max(LIMIT["upper"], low + 2.0 * np.pi)
     if low >= high:
         raise DataError(f"limit of joint {name}", str(path), f"{low:g} to {high:g}", "a lower limit below the upper")
     return low, high

@@ -52,6 +52,30 @@ def test_links_may_bear_the_names_of_joints(irb, tmp_path):
     assert build_plant(same).model.nv == build_plant(irb).model.nv
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "read"),
+    [
+        ("-1", "2", (-1.0, 2.0)),
+        ("0", "0", (-np.pi, np.pi)),
+        ("-inf", "inf", (-np.pi, np.pi)),
+        ("4", "1e16", (4.0, 4.0 + 2.0 * np.pi)),
+        ("-inf", "1", (1.0 - 2.0 * np.pi, 1.0)),
+    ],
+)
+def test_limits_without_bound_are_those_of_a_turn(tmp_path, low, high, read):
+    """Which Pinocchio reads too."""
+    text = load_robot("twomass").urdf.read_text().replace('type="continuous"', 'type="revolute"')
+    text = re.sub("<limit [^>]*/>", "", text)
+    limit = f'<limit lower="{low}" upper="{high}" effort="1" velocity="1"/></joint>'
+    for file in load_robot("twomass").folder.iterdir():
+        if file.is_file():
+            (tmp_path / file.name).write_text(file.read_text())
+    (tmp_path / "twomass.urdf").write_text(text.replace("</joint>", limit, 1))
+    robot = load_robot(tmp_path)
+    assert (robot.q_min[0], robot.q_max[0]) == pytest.approx(read)
+    assert build_structure(robot).n == 1
+
+
 @pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
 @pytest.mark.parametrize("axis", ["1 0 0", "0 -1 0", "0 0 2", "1 -2 0.5"])
 def test_joints_of_any_kind_turn_about_any_axis(tmp_path, kind, axis):

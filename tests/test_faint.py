@@ -401,6 +401,9 @@ def test_denied_causes_are_taken_back_where_others_stand(identified, hypotheses,
     left, (line,) = without_denied(setup, found)
     assert [e.hypothesis for e in left.final.model.effects] == [late] and left.rounds == rounds[:1]
     assert "encoder_eccentricity at elbow_joint" in line
+    monkeypatch.setattr("ident.refuted.denied", lambda *args: True)
+    first, (line,) = without_denied(setup, found)  # of two that are denied the one that was found first stays
+    assert first.rounds == rounds[:1] and "encoder_eccentricity" in line
     alone = replace(found, rounds=rounds[1:], final=replace(final, model=replace(final.model, effects=effects[1:])))
     assert without_denied(setup, alone) == (alone, [])
 

@@ -89,6 +89,11 @@ def test_what_no_robot_can_be_made_of_names_the_urdf_and_the_joint(tmp_path, old
             'lower="-1e16" upper="inf"',
             "joint wrist has no limits in the URDF: a turn is taken",
         ),
+        (
+            'lower="-1" upper="1"',
+            'lower="4" upper="1e16"',
+            "joint wrist has a limit to one side alone in the URDF: a turn or more is taken",
+        ),
         ('lower="-1" upper="1"', "", "joint wrist has no limits in the URDF: a turn is taken"),
         ('effort="20"', 'effort="many"', "effort of joint wrist is 'many', which is no limit: one is guessed"),
         ('velocity="3"', 'velocity="-3"', "velocity of joint shoulder is '-3', which is no limit: one is guessed"),

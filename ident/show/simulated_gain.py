@@ -17,6 +17,7 @@ from ident.held_out import with_held_out
 from ident.identification import identify
 from ident.inverse import Sampling
 from ident.left_out import SEED
+from ident.lost_samples import with_lost_samples_filled
 from ident.model import Model
 from ident.output_noise import noise_covariance
 from ident.parallel import one_thread_each
@@ -57,7 +58,7 @@ def simulated_gain(
     Raises:
         DataError: where the dataset has no held-out segments.
     """
-    dataset = with_held_out(dataset)
+    dataset = with_held_out(with_lost_samples_filled(dataset)[0])
     setup, baseline = identify(dataset, progress=progress)
     if not setup.held_out:
         raise DataError("segments", dataset.name, "none of role validation", "at least one to simulate")
