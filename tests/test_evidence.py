@@ -186,7 +186,7 @@ def test_an_absent_parameter_costs_what_is_lost_without_it_and_more_where_it_mak
 def test_a_friction_of_any_posture_that_is_of_none_is_no_rival(named, slope, curvature, absent):
     """Without slope and curvature it is Coulomb's, and fits as well."""
     h = named["unknown:position_friction", "elbow_joint"]
-    known = candidate(h, [3.0, slope, curvature, 1e-3], [0.0, 1e4, 1e4, 0.0])
+    known = candidate(h, [3.0, slope, curvature, 1e-3, 0.0], [0.0, 1e4, 1e4, 0.0, 0.0])
     seen = -0.5 * np.log(1.0 + 1e4 / TEMPER)  # of one whose spread before the data is its own size
     assert occam(known, TEMPER) == pytest.approx(-POINTLESS_NATS if absent else seen, abs=1e-3)
 

@@ -546,9 +546,10 @@ def rising_friction(joint: int, place: str) -> Hypothesis:
     )
 
 
-def position_friction(joint: int, place: str) -> Hypothesis:
+def position_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """Decoy: friction whose size depends on the position of the joint, ``(constant + slope q + curvature q^2)
     sign(v)``."""
+    lead, none = sought(LEAD, leads)
 
     def units(motion: Motion, j: int, smoothing: float) -> tuple[np.ndarray, ...]:
         q, s = motion.q(j), sense(motion, j, smoothing)
@@ -556,8 +557,7 @@ def position_friction(joint: int, place: str) -> Hypothesis:
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
         q = motion.q(j)
-        size = p[0] + p[1] * q + p[2] * q**2
-        return dry(motion, j, p[3], size)
+        return dry(motion, j, p[3], p[0] + p[1] * q + p[2] * q**2, None, *p[4:])
 
     return Hypothesis(
         "unknown:position_friction",
@@ -569,14 +569,15 @@ def position_friction(joint: int, place: str) -> Hypothesis:
             Parameter("slope", "N m/rad", -1e9, 1e9, null=0.0),
             Parameter("curvature", "N m/rad2", -1e9, 1e9, null=0.0),
             SMOOTHING,
+            *lead,
         ),
         law,
         turns,
-        lambda motion, j, k, shape: Screen(units(motion, j, shape[0]), lambda c: np.array([*c, shape[0]]), shape),
+        lambda motion, j, k, shape: Screen(units(motion, j, shape[0]), lambda c: np.array([*c, shape[0], *none]), shape),
         "The residual torque of {joint} changes sign with direction, and its size with position.",
         options={
             "absorbs": "coulomb_friction",
-            "absorb": lambda p, weights, old: np.array([old[0] + weights[0], weights[1], weights[2], old[2]]),
+            "absorb": lambda p, weights, old: np.array([old[0] + weights[0], weights[1], weights[2], *old[2:]]),
             "essential": ("slope", "curvature"),
             "dry": True,
         },
