@@ -121,7 +121,7 @@ class Findings:
 
 def conclude(found: Findings) -> Verdict:
     """Put what was found into the words and numbers of verdict.json."""
-    dataset, result, joints = found.dataset, found.result, found.dataset.joints
+    dataset, result = found.dataset, found.result
     tones = of_their_own(found.tones, found.final)
     direct = seen_in_samples(found)
     nameless = bool(tones) or any(not x.every for x in found.lost)
@@ -144,11 +144,25 @@ def conclude(found: Findings) -> Verdict:
         unexplained_share=1.0 if alone else found.left,
         unexplained_verdict=UNKNOWN if unknown else "noise floor reached",
         gain=found.gain,
-        next_experiment=found.separating.text if found.separating else advice(causes, unknown, len(joints)),
+        next_experiment=next_step(found, causes, unknown, alone),
         sentence=sentence(causes, unknown, detected, found.gain),
         unidentified=undetermined,
         notes=tuple(notes_on(found, causes, tones, detected)),
     )
+
+
+def next_step(found: Findings, causes: Sequence[Cause], unknown: bool, alone: bool) -> str | None:
+    """What to do next, in a sentence; None where nothing asks for more.
+
+    Args:
+        alone: whether what has no name, and no fit, is all that was found.
+    """
+    lost = [f"{x.channel} of {found.dataset.joints[x.joint]}" for x in found.lost if not x.every]
+    if alone and lost:
+        return (
+            f"Mend what loses samples of {' and '.join(lost)}, and record again: with these filled nothing else shows."
+        )
+    return found.separating.text if found.separating else advice(causes, unknown, found.dataset.n)
 
 
 def is_refuted(found: Findings) -> bool:

@@ -138,6 +138,7 @@ def test_lost_samples_are_an_unknown_cause_and_no_delay(tmp_path):
     assert verdict.discrepancy.detected and verdict.unexplained_verdict == UNKNOWN and not verdict.causes
     assert verdict.discrepancy.where[0].feature == "samples that repeat the one before"
     assert any("of the samples repeat" in note for note in verdict.notes)
+    assert verdict.next_experiment.startswith("Mend what loses samples of q of")
     _, (lost,) = with_lost_samples_filled(lossy)
     assert lost.every == 0 and lost.share == pytest.approx(0.2, abs=0.02)
 

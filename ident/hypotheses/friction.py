@@ -573,7 +573,9 @@ def position_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
         ),
         law,
         turns,
-        lambda motion, j, k, shape: Screen(units(motion, j, shape[0]), lambda c: np.array([*c, shape[0], *none]), shape),
+        lambda motion, j, k, shape: Screen(
+            units(motion, j, shape[0]), lambda c: np.array([*c, shape[0], *none]), shape
+        ),
         "The residual torque of {joint} changes sign with direction, and its size with position.",
         options={
             "absorbs": "coulomb_friction",
