@@ -13,7 +13,7 @@ import scipy.signal
 from ident.chain import build_structure
 from ident.dataset import Dataset, Segment
 from ident.lost_samples import CHANNELS as REPEATED
-from ident.lost_samples import lost_among, resolution
+from ident.lost_samples import lost_among, resolution, runs_of
 from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
@@ -120,7 +120,8 @@ def stuck_warnings(s: Segment, dataset: Dataset) -> list[str]:
             if np.ptp(x) == 0:
                 out.append(f"{channel}_{j + 1} ({name}) is frozen")
                 continue
-            starts, lengths = _runs(x)
+            runs = runs_of(x)
+            starts, lengths = runs.starts, runs.lengths
             k = int(np.argmax(lengths))
             a, b = int(starts[k]), int(starts[k] + lengths[k])
             if channel == "tau":
@@ -143,12 +144,6 @@ def stuck_warnings(s: Segment, dataset: Dataset) -> list[str]:
                 if channel == "tau" and share > CLIPPED and len(starts) > 30:
                     out.append(f"tau_{j + 1} ({name}) is clipped {word} {top:.4g} {unit}, {share:.1%} of the time")
     return out
-
-
-def _runs(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Starts and lengths of the runs of equal values."""
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(x) != 0) + 1])
-    return starts, np.diff(np.concatenate([starts, [len(x)]]))
 
 
 def freeze_warnings(s: Segment, dataset: Dataset) -> list[str]:

@@ -74,7 +74,7 @@ def with_lost_samples_filled(dataset: Dataset) -> tuple[Dataset, tuple[LostSampl
 def lost_among(records: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
     """Samples of the records of one signal, (N,) each, that repeat the one before where the motion about them does not
     stop; and ``LostSamples.every``."""
-    runs = [_runs(x) for x in records]
+    runs = [runs_of(x) for x in records]
     whole, step = sum(map(len, records)), np.concatenate([np.abs(np.diff(r.values)) for r in runs] or [np.empty(0)])
     count = resolution(step)
     if sum(_clear(r, count) for r in runs) < max(FEWEST, LEAST * whole):
@@ -86,7 +86,7 @@ def lost_among(records: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
 
 
 @dataclass(frozen=True)
-class _Runs:
+class Runs:
     """Runs of equal values of a signal: their values, where they start, and how many samples they last."""
 
     values: np.ndarray
@@ -94,12 +94,13 @@ class _Runs:
     lengths: np.ndarray
 
 
-def _runs(x: np.ndarray) -> _Runs:
+def runs_of(x: np.ndarray) -> Runs:
+    """The runs of equal values of a signal (N,)."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1])
-    return _Runs(x[starts], starts, np.diff(np.concatenate([starts, [len(x)]])))
+    return Runs(x[starts], starts, np.diff(np.concatenate([starts, [len(x)]])))
 
 
-def _clear(runs: _Runs, count: float) -> int:
+def _clear(runs: Runs, count: float) -> int:
     """Repeated samples that no motion explains.
 
     Args:
@@ -120,7 +121,7 @@ def _clear(runs: _Runs, count: float) -> int:
     return int(np.sum((between - 1)[clear]))
 
 
-def _repeats(runs: _Runs, count: float) -> np.ndarray:
+def _repeats(runs: Runs, count: float) -> np.ndarray:
     """(N,) samples that repeat the one before, of an encoder with counts those alone after which it skips some: slow
     motion repeats the others."""
     short = (runs.lengths > 1) & (runs.lengths <= LONGEST)
