@@ -124,7 +124,7 @@ def conclude(found: Findings) -> Verdict:
     dataset, result = found.dataset, found.result
     tones = of_their_own(found.tones, found.final)
     direct = seen_in_samples(found)
-    nameless = bool(tones) or any(not x.every for x in found.lost)
+    nameless = bool(tones) or any(x.many for x in found.lost)
     alone = nameless and not result.detected and not direct
     refuted = is_refuted(found)
     unknown = cause_remains(found, refuted) or alone
@@ -157,7 +157,7 @@ def next_step(found: Findings, causes: Sequence[Cause], unknown: bool, alone: bo
     Args:
         alone: whether what has no name, and no fit, is all that was found.
     """
-    lost = [f"{x.channel} of {found.dataset.joints[x.joint]}" for x in found.lost if not x.every]
+    lost = [f"{x.channel} of {found.dataset.joints[x.joint]}" for x in found.lost if x.many]
     if alone and lost:
         return (
             f"Mend what loses samples of {' and '.join(lost)}, and record again: with these filled nothing else shows."
@@ -240,7 +240,7 @@ def places(found: Findings, tones: Sequence[Tone]) -> Iterator[Where]:
         yield Where(joints[tone.joint], "tau", f"a tone at {tone.frequency_hz:.4g} Hz", 1.0)
     for lag in found.late:
         yield Where(joints[lag.joint], "q_link", "position that follows the velocity", 1.0)
-    for lost in (x for x in found.lost if not x.every):
+    for lost in (x for x in found.lost if x.many):
         yield Where(joints[lost.joint], lost.channel, "samples that repeat the one before", 1.0)
 
 

@@ -24,6 +24,7 @@ STEPS, NEAR = 1.5, 33  # change after a repeated value over the least of as many
 CAUGHT_UP = 0.5  # difference, relative, of the speed over repeated values from those before and after
 LONGEST = 20  # samples: where more are alike a joint rests, or the log froze
 FEWEST, LEAST = 5, 1e-3  # such samples of a joint from which any were lost, and their share
+MANY = 0.01  # share that is a cause
 REGULAR = 0.8  # share of the values that stand as long as most, or a multiple of it, where a slower clock repeats them
 ROWS = 0.9  # share of the repeated values that come with all torques repeated, from which rows of the log came twice
 DEGREE = 5  # of the spline that fills them
@@ -44,6 +45,11 @@ class LostSamples:
     channel: str
     share: float
     every: int = 0
+
+    @property
+    def many(self) -> bool:
+        """Whether so many were lost at random that they are a cause, and no untidiness of the log."""
+        return not self.every and self.share >= MANY
 
 
 def with_lost_samples_filled(dataset: Dataset) -> tuple[Dataset, tuple[LostSamples, ...]]:

@@ -190,7 +190,7 @@ def lost_note(lost: LostSamples, joint: str) -> str:
         return f"{lost.channel} of {joint} has a new value every {lost.every} samples only: those between were filled by interpolation."
     return (
         f"Of {lost.channel} of {joint} {lost.share:.1%} of the samples repeat the one before, in motion: they were lost. They were filled"
-        " by interpolation, and nothing of the catalogue does that."
+        f" by interpolation{', and nothing of the catalogue does that' if lost.many else ''}."
     )
 
 

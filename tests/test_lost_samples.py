@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ident.checking import inspect_dataset
 from ident.diagnosis import diagnose
-from ident.lost_samples import filled, lost_among, with_lost_samples_filled
+from ident.lost_samples import LostSamples, filled, lost_among, with_lost_samples_filled
 from ident.verdict import UNKNOWN
 from robot_assets.robot import load_robot
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -141,6 +141,11 @@ def test_lost_samples_are_an_unknown_cause_and_no_delay(tmp_path):
     assert verdict.next_experiment.startswith("Mend what loses samples of q of")
     _, (lost,) = with_lost_samples_filled(lossy)
     assert lost.every == 0 and lost.share == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize(("share", "every", "many"), [(0.005, 0, False), (0.02, 0, True), (0.5, 2, False)])
+def test_few_samples_or_those_of_a_slower_clock_are_no_cause(share, every, many):
+    assert LostSamples(0, "q", share, every).many is many
 
 
 def test_a_clock_shows_in_motions_that_rest():
