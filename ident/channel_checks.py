@@ -13,7 +13,7 @@ import scipy.signal
 from ident.chain import build_structure
 from ident.dataset import Dataset, Segment
 from ident.lost_samples import CHANNELS as REPEATED
-from ident.lost_samples import lost_among, resolution, runs_of
+from ident.lost_samples import lost_among, resolution, runs_of, same_as_before
 from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
@@ -151,9 +151,8 @@ def freeze_warnings(s: Segment, dataset: Dataset) -> list[str]:
     rate, rows = dataset.sample_rate, np.concatenate([s.q, s.tau], axis=1)
     if len(rows) < 64 or not np.any(np.ptp(s.q, axis=0) > 0):
         return []
-    edges = np.flatnonzero(np.any(np.diff(rows, axis=0) != 0, axis=1)) + 1
-    starts = np.concatenate([[0], edges])
-    lengths = np.diff(np.concatenate([starts, [len(rows)]]))
+    runs = runs_of(rows)
+    starts, lengths = runs.starts, runs.lengths
     usual = int(np.median(lengths))
     out = []
     if usual > 1 and np.mean(np.abs(lengths - usual) <= 1) > REGULAR:
@@ -206,7 +205,8 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
     counts = np.array([resolution(x) for x in step.T])
     fast = usual > 8 * np.maximum(noise, counts)
     moving = np.any(fast, axis=1)
-    repeated = int(np.sum(np.all(rows[1:] == rows[:-1], axis=1) & moving))
+    together = same_as_before(rows)
+    repeated = int(np.sum(together[1:] & moving))
     # A lost sample is lost for all joints; one joint alone may stumble by itself.
     even = np.abs(np.abs(step) - usual) < 0.3 * usual
     around = np.pad(even, ((1, 1), (0, 0)))
@@ -219,7 +219,6 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
         out.append(
             f"{repeated} samples ({repeated / len(rows):.1%}) repeat the one before in all channels, in motion: lost packets"
         )
-    together = np.append(False, np.all(rows[1:] == rows[:-1], axis=1))
     for channel in REPEATED:
         x = getattr(s, channel)
         for j, name in enumerate(dataset.joints if x is not None else ()):

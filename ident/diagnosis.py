@@ -84,7 +84,12 @@ def diagnose_fully(
     setup, problem, baseline = sought.setup, sought.setup.problem, sought.baseline
     first = predictions(problem, baseline.model, baseline.remainders)
     say("gain on held-out data")
-    result, test, notes = tested(sought, first, "validation segments" if dataset is given else END_HELD_OUT, workers)
+    belied = {r.candidates[0].hypothesis.key for r in sought.result.rounds if denied(problem, setup.held_out, r)}
+    kept, notes = without_denied(problem, sought.result, belied)
+    result, test, more = tested(
+        sought, kept, first, "validation segments" if dataset is given else END_HELD_OUT, workers
+    )
+    notes += more
     say("evidence")
     last = predictions(problem, result.final.model, result.final.remainders)
     separating = separating_experiment(problem, result)
@@ -101,7 +106,7 @@ def diagnose_fully(
             late=find_link_delays(sought.recorded, last, problem.sampling.sample_time),
             separating=separating,
             rigid=sought.rigid if result is sought.result or result.rounds else None,
-            belied={r.candidates[0].hypothesis.key for r in result.rounds if denied(problem, setup.held_out, r)},
+            belied=belied.intersection(r.candidates[0].hypothesis.key for r in result.rounds),
             tones=tones_of(sought.recorded, last),
             lost=lost,
         )
@@ -141,11 +146,12 @@ def diagnose_fully(
 
 
 def tested(
-    sought: Sought, first: Sequence[Prediction], method: str, workers: Workers
+    sought: Sought, kept: Attribution, first: Sequence[Prediction], method: str, workers: Workers
 ) -> tuple[Attribution, HeldOut, list[str]]:
     """Causes without those that held-out data refute, what they gain there, and what is to be said about it.
 
     Args:
+        kept: its causes, without those that are denied.
         first: what the first model predicts.
         method: how segments are held out, for the verdict.
     """
@@ -156,9 +162,7 @@ def tested(
         renewed = inertias and sought.rigid is not None
         return held_out(sought.setup, sought.nominal, baseline, found, renewed, affected, method, workers)
 
-    result, denied_lines = without_denied(sought.setup, sought.result)
-    result, test, lines = taken_back(sought.setup, result, of_model)
-    notes = [*denied_lines, *lines]
+    result, test, notes = taken_back(sought.setup, kept, of_model)
     if test.told_by_torque:
         notes.append(chosen_motion_note(test.told_by_torque))
     return result, test, notes

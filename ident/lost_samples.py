@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import minimum_filter1d
 
-from ident.dataset import Dataset
+from ident.dataset import Dataset, Segment
 
 CHANNELS = ("q", "q_link")
 STANDS_OUT = 4.0  # error of a repeated value over that of a straight line between its neighbours elsewhere
@@ -57,24 +57,24 @@ def with_lost_samples_filled(dataset: Dataset) -> tuple[Dataset, tuple[LostSampl
 
     Not where rows of the log came twice: torque and position still go together there.
     """
-    found = []
+    found, segments = [], list(dataset.segments)
     for channel in CHANNELS:
         for j in range(dataset.n):
             at = [
                 k
-                for k, s in enumerate(dataset.segments)
+                for k, s in enumerate(segments)
                 if (x := getattr(s, channel)) is not None and np.all(np.isfinite(x[:, j]))
             ]
-            records = [getattr(dataset.segments[k], channel)[:, j] for k in at]
+            records = [getattr(segments[k], channel)[:, j] for k in at]
             lost, every = lost_among(records)
             count = sum(int(np.sum(x)) for x in lost)
-            twice = sum(int(np.sum(x & _row_again(dataset.segments[k].tau))) for k, x in zip(at, lost, strict=True))
+            twice = sum(int(np.sum(x & same_as_before(segments[k].tau))) for k, x in zip(at, lost, strict=True))
             if not count or twice > ROWS * count:
                 continue
             found.append(LostSamples(j, channel, count / sum(map(len, records)), every))
             for k, x, gone in zip(at, records, lost, strict=True):
-                dataset = _with(dataset, k, channel, j, filled(x, gone))
-    return dataset, tuple(found)
+                segments[k] = _with(segments[k], channel, j, filled(x, gone))
+    return replace(dataset, segments=tuple(segments)) if found else dataset, tuple(found)
 
 
 def lost_among(records: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int]:
@@ -101,8 +101,8 @@ class Runs:
 
 
 def runs_of(x: np.ndarray) -> Runs:
-    """The runs of equal values of a signal (N,)."""
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1])
+    """The runs of equal values of a signal (N,), or of equal rows (N, m)."""
+    starts = np.flatnonzero(~same_as_before(x))
     return Runs(x[starts], starts, np.diff(np.concatenate([starts, [len(x)]])))
 
 
@@ -165,15 +165,13 @@ def resolution(step: np.ndarray) -> float:
     return 0.0
 
 
-def _row_again(tau: np.ndarray) -> np.ndarray:
-    """(N,) samples whose torques (N, n) are all those of the one before too."""
-    return np.concatenate([[False], np.all(tau[1:] == tau[:-1], axis=1)])
+def same_as_before(x: np.ndarray) -> np.ndarray:
+    """(N,) samples, or rows (N, m), that are those before them in all numbers."""
+    return np.concatenate([[False], np.all(x[1:] == x[:-1], axis=tuple(range(1, x.ndim)))])
 
 
-def _with(dataset: Dataset, segment: int, channel: str, joint: int, x: np.ndarray) -> Dataset:
-    """A dataset with another signal at a joint of a segment."""
-    segments = list(dataset.segments)
-    signals = getattr(segments[segment], channel).copy()
+def _with(segment: Segment, channel: str, joint: int, x: np.ndarray) -> Segment:
+    """A segment with another signal at a joint."""
+    signals = getattr(segment, channel).copy()
     signals[:, joint] = x
-    segments[segment] = replace(segments[segment], **{channel: signals})
-    return replace(dataset, segments=tuple(segments))
+    return replace(segment, **{channel: signals})

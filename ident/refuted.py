@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from ident.parallel import Workers
 from ident.problem import NOT_COMPUTED, Problem
 from ident.pruning import without_effect
 from ident.torque_fit import Fit
-from ident.trust import denied, fails_held_out, is_halved
+from ident.trust import fails_held_out, is_halved
 from ident.units import torque_unit, units_of_torques
 from ident.values import named_effects
 from ident.verdict import LEFT_OUT, Gain
@@ -115,20 +115,24 @@ def leave_one_out(
     return joined(workers.map(without, points))
 
 
-def without_denied(setup: Setup, result: Attribution) -> tuple[Attribution, list[str]]:
-    """A result without the causes, found within the noise beside others, that held-out data deny (``trust.denied``),
-    and a line on each.
+def without_denied(
+    problem: Problem, result: Attribution, belied: Collection[tuple[str, str]]
+) -> tuple[Attribution, list[str]]:
+    """A result without the causes, found within the noise beside others, that held-out data deny, and a line on each.
 
     A cause that stands alone stays: something was seen, and it is not that.
+
+    Args:
+        belied: causes, by ``key``, that are denied (``trust.denied``).
     """
     lines = []
     for found in reversed(result.rounds):
         cause = found.candidates[0].hypothesis
         named = {e.hypothesis.key for e in named_effects(result.final)}
-        if cause.key not in named or len(named) < 2 or not denied(setup.problem, setup.held_out, found):
+        if cause.key not in named or len(named) < 2 or cause.key not in belied:
             continue
         try:
-            result = _without(setup.problem, result, cause.key)
+            result = _without(problem, result, cause.key)
         except NOT_COMPUTED:
             continue
         lines.append(

@@ -6,13 +6,11 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from robot_assets.urdf import BOUNDLESS
+from robot_assets.urdf import BOUNDLESS, MOMENTS, principal
 
 FARTHEST = 10.0  # m: a centre of mass or a joint, from the frame it is given in
 WIDEST = 3.0  # m: radius of gyration of a link
 TURNS = 4 * np.pi  # rad: limit of a turning joint
-MOMENTS = ("ixx", "iyy", "izz")
-PRODUCTS = ("ixy", "ixz", "iyz")
 EXCESS = 0.02  # of the largest moment, by which it may exceed the other two together: rounding in a file
 SLIGHT = 1e-5  # kg m2, the same: placeholders of links that weigh nothing
 
@@ -33,7 +31,8 @@ def _of_link(link: ET.Element, name: str) -> list[str]:
         return []
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
     m = 0.0 if mass is None else float(mass.get("value", 0))
-    largest = max(float("0" if tensor is None else tensor.get(k, "0")) for k in MOMENTS)
+    moments = [float("0" if tensor is None else tensor.get(k, "0")) for k in MOMENTS]
+    largest = max(moments[:3])
     out = [] if (far := _far(inertial)) is None else [f"the centre of mass of {name} is {far:.3g} m off: in mm?"]
     if m > 0 and np.sqrt(largest / m) > WIDEST:
         out.append(
@@ -41,20 +40,12 @@ def _of_link(link: ET.Element, name: str) -> list[str]:
         )
     elif m == 0 and largest > 1.0:
         out.append(f"the inertia of {name} is {largest:.3g} kg m2 without a mass")
-    a, b, c = _principal(tensor)
+    a, b, c = principal(moments)
     if c - a - b > max(EXCESS * c, SLIGHT):
         out.append(
             f"{name} has moments of inertia of {a:.3g}, {b:.3g} and {c:.3g} kg m2: of a body the largest is no more than the others together"
         )
     return out
-
-
-def _principal(tensor: ET.Element | None) -> np.ndarray:
-    """(3,) moments of inertia, ascending."""
-    (xx, yy, zz), (xy, xz, yz) = (
-        [float("0" if tensor is None else tensor.get(k, "0")) for k in keys] for keys in (MOMENTS, PRODUCTS)
-    )
-    return np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _of_joint(joint: ET.Element, name: str) -> list[str]:

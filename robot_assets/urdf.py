@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.parsers import expat
@@ -228,12 +229,17 @@ def _check_inertial(inertial: ET.Element | None, link: str, path: Path) -> None:
         raise DataError(f"inertial of link {link}", str(path), "no mass or no inertia", "both")
     if _number(mass.get("value"), f"mass of link {link}", path) < 0:
         raise DataError(f"mass of link {link}", str(path), str(mass.get("value")), "at least zero")
-    xx, yy, zz, xy, xz, yz = (_number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in MOMENTS)
-    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    moments = principal([_number(tensor.get(key, "0"), f"{key} of link {link}", path) for key in MOMENTS])
     if moments.min() < -max(NEGATIVE * np.abs(moments).max(), SLIGHT):
         raise DataError(
             f"inertia of link {link}", str(path), f"a moment of {moments.min():.3g} kg m2", "moments of at least zero"
         )
+
+
+def principal(tensor: Sequence[float]) -> np.ndarray:
+    """(3,) moments of inertia, ascending, of a tensor in the order of ``MOMENTS``."""
+    xx, yy, zz, xy, xz, yz = tensor
+    return np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _numbers(origin: ET.Element | None, what: str, path: Path) -> None:

@@ -386,7 +386,7 @@ def test_a_diagnosis_asks_held_out_data_about_its_causes(clean, identified, hypo
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
 
 
-def test_denied_causes_are_taken_back_where_others_stand(identified, hypotheses, monkeypatch):
+def test_denied_causes_are_taken_back_where_others_stand(identified, hypotheses):
     """The last that stands stays, as something was seen."""
     _, setup, baseline = identified
     late, off = (
@@ -397,15 +397,15 @@ def test_denied_causes_are_taken_back_where_others_stand(identified, hypotheses,
     final = refit(setup.problem, replace(baseline.model, effects=effects), baseline.weights, baseline.remainders)
     rounds = tuple(Round(baseline, (Candidate(h, final, 0.0, 1.0),), (), 1.0, 1.0) for h in (late, off))
     found = Attribution(baseline, True, False, 0.0, rounds, final, False)
-    monkeypatch.setattr("ident.refuted.denied", lambda problem, groups, of: of.candidates[0].hypothesis is off)
-    left, (line,) = without_denied(setup, found)
+    left, (line,) = without_denied(setup.problem, found, {off.key})
     assert [e.hypothesis for e in left.final.model.effects] == [late] and left.rounds == rounds[:1]
     assert "encoder_eccentricity at elbow_joint" in line
-    monkeypatch.setattr("ident.refuted.denied", lambda *args: True)
-    first, (line,) = without_denied(setup, found)  # of two that are denied the one that was found first stays
+    first, (line,) = without_denied(
+        setup.problem, found, {late.key, off.key}
+    )  # of two that are denied the one that was found first stays
     assert first.rounds == rounds[:1] and "encoder_eccentricity" in line
     alone = replace(found, rounds=rounds[1:], final=replace(final, model=replace(final.model, effects=effects[1:])))
-    assert without_denied(setup, alone) == (alone, [])
+    assert without_denied(setup.problem, alone, {off.key}) == (alone, [])
 
 
 @pytest.mark.parametrize("clear", [True, False])
