@@ -152,6 +152,13 @@ def test_limits_for_all_joints_give_way_to_those_of_one(tmp_path):
     assert not robot.loads and not robot.guessed["torque_limit"]
 
 
+def test_limits_and_noise_may_have_a_table_of_each_joint(tmp_path):
+    limits = "[limits.shoulder]\ntorque = 7.0\nvelocity = 1.5\n[limits.elbow]\neffort_limit = 8.0\n"
+    robot = load_robot(planar(tmp_path, f"{DRIVES}{limits}[noise.elbow]\nq_std = 4e-6\n"))
+    assert robot.array("torque_limit").tolist() == [7.0, 8.0] and robot.array("velocity_limit").tolist() == [1.5, 3.0]
+    assert robot.array("q_std").tolist() == [3e-6, 4e-6]
+
+
 @pytest.mark.parametrize(
     ("drives", "found"),
     [
@@ -168,6 +175,7 @@ def test_limits_for_all_joints_give_way_to_those_of_one(tmp_path):
         (f"{DRIVES}[load]\n{LOAD}[[loads]]\n{LOAD}", "[[load]] beside it"),
         (f"{DRIVES}[limits]\neffort = [1.0]", "[1.0]"),
         (f"{DRIVES}[limits]\neffort = 1.0\ntorque_max = 1.0", "torque_max beside it"),
+        (f"{DRIVES}[limits.wrist]\neffort = 1.0", "[limits.wrist]"),
         (f'{LISTED}[[drive]]\njoint = "shoulder"\n{EACH[0]}', "drives of ['shoulder']"),
         (LISTED + f'[[drive]]\njoint = "elbow"\n{EACH[0]}' * 2, "drives of ['elbow', 'elbow']"),
         (f"{LISTED}[[drive]]\n{EACH[0]}[[joint]]\n{EACH[1]}", "[[joint]] beside it"),
