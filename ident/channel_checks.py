@@ -12,8 +12,7 @@ import scipy.signal
 
 from ident.chain import build_structure
 from ident.dataset import Dataset, Segment
-from ident.lost_samples import CHANNELS as REPEATED
-from ident.lost_samples import lost_among, resolution, runs_of, same_as_before
+from ident.lost_samples import resolution, runs_of, same_as_before
 from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
@@ -196,7 +195,7 @@ def _amid_motion(q: np.ndarray, a: int, b: int, still: np.ndarray, rate: float) 
 
 
 def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
-    """Samples that repeat the one before in all channels, and positions that take two steps in one."""
+    """Samples that repeat the one before in all channels, and positions of all joints that take two steps in one."""
     rows = np.concatenate([s.q, s.tau], axis=1)
     step = np.diff(s.q, axis=0)
     noise = np.maximum(difference_noise(s.q), 1e-300) if len(s.q) > 8 else np.full(dataset.n, np.inf)
@@ -219,16 +218,6 @@ def lost_sample_warnings(s: Segment, dataset: Dataset) -> list[str]:
         out.append(
             f"{repeated} samples ({repeated / len(rows):.1%}) repeat the one before in all channels, in motion: lost packets"
         )
-    for channel in REPEATED:
-        x = getattr(s, channel)
-        for j, name in enumerate(dataset.joints if x is not None else ()):
-            if not np.all(np.isfinite(x[:, j])):
-                continue
-            share = float(np.mean(lost_among([x[:, j]])[0][0] & ~together))
-            if share > 0.0:
-                out.append(
-                    f"{channel}_{j + 1} ({name}): {share:.1%} of the samples repeat the one before, in motion: lost samples"
-                )
     if jumps > max(2, 1e-3 * moving.sum()):
         out.append(f"{jumps} double steps of position between samples: dropped samples")
     return out

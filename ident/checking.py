@@ -19,6 +19,7 @@ from ident.channel_checks import (
 )
 from ident.dataset import CHANNELS, Dataset, Segment
 from ident.held_out import not_fitted, with_held_out
+from ident.lost_samples import with_lost_samples_filled
 from ident.parallel import one_thread_each
 from ident.period_checks import period_warnings
 from ident.rest import difference_noise
@@ -191,6 +192,18 @@ def _partial(dataset: Dataset) -> list[str]:
     return out
 
 
+def _lost(dataset: Dataset) -> list[str]:
+    """Positions of single joints that repeat values in motion, as a diagnosis finds and fills them."""
+    out = []
+    for lost in with_lost_samples_filled(dataset)[1]:
+        what = f"{lost.channel}_{lost.joint + 1} ({dataset.joints[lost.joint]})"
+        if lost.every:
+            out.append(f"{what} has a new value every {lost.every} samples only: a slower clock than that of the log")
+        else:
+            out.append(f"{what}: {lost.share:.1%} of the samples repeat the one before, in motion: lost samples")
+    return out
+
+
 def _without_validation(dataset: Dataset) -> str:
     """How the gain is measured of data of which none are held out."""
     fitted = dataset.select(role="identification")
@@ -208,7 +221,7 @@ def _warnings(dataset: Dataset) -> list[str]:
         out.append(f"no validation segments: {_without_validation(dataset)}")
     if not any(s.role == "identification" for s in dataset.segments):
         out.append("no identification segments: there is nothing to fit")
-    out += [*_brief_warnings(dataset), *not_fitted(dataset), *_partial(dataset)]
+    out += [*_brief_warnings(dataset), *not_fitted(dataset), *_partial(dataset), *_lost(dataset)]
     alike: dict[str, list[str]] = {}
     for s in dataset.segments:
         found = [w for check in CHECKS for w in check(s, dataset)]

@@ -107,6 +107,8 @@ def test_a_slower_clock_is_none_that_loses(clean, every, coarse):
     (lost,) = found
     assert (lost.joint, lost.channel, lost.every) == (1, "q", every)
     assert lost.share == pytest.approx(1.0 - 1.0 / every, abs=0.05)
+    (told,) = [w for w in inspect_dataset(slower).warnings if w.startswith("q_2 ")]
+    assert f"has a new value every {every} samples only" in told
     for s, before, held in zip(whole.segments, data.segments, slower.segments, strict=True):
         error, was = (np.std(x - before.q[:, 1]) for x in (s.q[:, 1], held.q[:, 1]))
         assert error < 0.1 * was + data.robot.array("q_std")[1]
