@@ -156,7 +156,7 @@ def _with_own(
     if strange:
         raise DataError(f"[{table}.{strange[0]}]", where, show(strange[0]), f"one of the joints {names}")
     return [
-        _with_figures([entry], table, given.get(name, {}), figures, where)[0]
+        _with_figures([entry], table, given.get(str(name), {}), figures, where)[0]
         for name, entry in zip(names, entries, strict=True)
     ]
 
