@@ -21,7 +21,8 @@ SAMPLES = 4000  # looked at per joint
 BACKGROUND = 0.15  # median of the same over other steps: positions that dwell raise it at many
 STRETCH = 400.0  # half the positions in which steps blurred by noise are looked for, in least steps
 ON_GRID = 0.02  # distance from the grid, in steps, of samples that lie on it
-LEAST_CELLS = 20  # steps that the motion must span
+LEAST_CELLS = 20  # steps that the motion must span,
+FEWEST_LEVELS, EXACT = 3, 1e-3  # or so many positions at least that lie on the grid to this share of a step
 CELLS_PER_STEP = 8  # of the histogram of positions, in the least step
 CLEAR = 10.0  # power of a line over that of white rounding errors, above which it is motion
 SIZES = (0.8, 0.9, 1.1, 1.2)  # of a motion over that which is recorded, at which it is rounded once more
@@ -129,7 +130,7 @@ def _varying(group: Group, joint: int) -> float:
 def _exact_grid(q: np.ndarray) -> tuple[float, float] | None:
     """Step and its deviation where every sample is a whole number of steps from the others."""
     levels = np.unique(q)
-    if len(levels) < LEAST_CELLS or len(levels) > 0.7 * len(q):
+    if len(levels) < FEWEST_LEVELS or len(levels) > 0.7 * len(q):
         return None
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-6 * np.median(gaps)]
@@ -140,7 +141,8 @@ def _exact_grid(q: np.ndarray) -> tuple[float, float] | None:
         step = float(np.sum(near) / max(np.sum(np.round(near / step)), 1.0))
     cells = (levels - levels[0]) / step
     off = np.abs(cells - np.round(cells))
-    if np.ptp(levels) < LEAST_CELLS * step or np.mean(off < ON_GRID) < 0.98:
+    few = np.ptp(levels) < LEAST_CELLS * step
+    if np.any(off > EXACT) if few else np.mean(off < ON_GRID) < 0.98:
         return None
     return step, float(step * max(np.sqrt(np.mean(off**2)), 1e-9) / np.ptp(cells))
 

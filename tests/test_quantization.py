@@ -35,6 +35,19 @@ def test_a_rounded_position_shows_its_step(step, seed):
     assert blurred[0] == pytest.approx(step, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("levels", "jitter", "found"), [(5, 0.0, True), (3, 0.0, True), (2, 0.0, False), (5, 0.01, False)]
+)
+def test_a_joint_that_moves_by_few_steps_shows_them_where_they_are_exact(levels, jitter, found):
+    """Of positions that differ by other than whole steps so few tell none."""
+    step, q = 1.1e-3, motion(np.random.default_rng(0))
+    cells = np.round((levels - 1) * (q - q.min()) / np.ptp(q))
+    offsets = jitter * np.sin(np.arange(levels))
+    step_found = _exact_grid(step * (cells + offsets[cells.astype(int)]))
+    assert (step_found is not None) is found
+    assert step_found is None or step_found[0] == pytest.approx(step, rel=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_smooth_position_with_noise_has_no_steps(seed):
     rng = np.random.default_rng(seed)
