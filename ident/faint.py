@@ -40,6 +40,10 @@ DRAWS = 4  # of what noise may have left
 BY_PHASES = 2.5
 # share of what causes explain at a joint up to which more there may be errors of a few per cent of their laws
 SHADOW = 1e-3
+LATE = "_delay", "_lag"  # effects by which a channel comes late
+# of a sample: what a law that is not quite that of nature puts into the timing, which all joints have in common, is no
+# delay of those that show it
+LEAST_LATE = 5e-3
 
 
 def hidden(
@@ -86,7 +90,20 @@ def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis
     at_joints = left_by_laws(current, told)
     preds = predictions(problem, current.model, current.remainders)
     scores = in_signal(problem, current, preds, screen(problem, current, preds, hypotheses))
-    return [s for s in scores if s.start is not None and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))]
+    return [
+        s
+        for s in scores
+        if s.start is not None
+        and s.gain > _at(s.hypothesis, at_joints, np.max(at_joints))
+        and not (current.model.effects and of_timing(s, problem.sampling.sample_time))
+    ]
+
+
+def of_timing(score: Score, sample_time: float) -> bool:
+    """Whether a hypothesis asks for a joint that is late by no more than an error of the common timing may be."""
+    if score.start is None or not score.hypothesis.effect.endswith(LATE):
+        return False
+    return bool(score.start[0] < LEAST_LATE * sample_time)
 
 
 def in_signal(problem: Problem, current: Fit, preds: Sequence[Prediction], scores: Sequence[Score]) -> list[Score]:

@@ -13,7 +13,7 @@ from ident.contests import SAME_PERIOD
 from ident.costs import fair_costs, weighted_cost
 from ident.evidence import WAVE, is_wave
 from ident.extended import Prediction
-from ident.faint import SHADOW
+from ident.faint import LATE, SHADOW
 from ident.group import Group
 from ident.hypotheses import Hypothesis
 from ident.hypotheses.hypothesis import RIPPLE
@@ -43,7 +43,6 @@ HALF_TRUSTED = 0.1
 DENIED_SHARE = 0.25
 CHANCE = 3.0  # standard deviations of that fall, within which it may be short by chance
 PATCHES = 3  # bodies and hinges other than those described, from which no name is trusted
-LATE = "_delay", "_lag"  # effects by which a channel comes late
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
 

@@ -12,7 +12,20 @@ from ident.attribute import LEFT_TO_DECOYS, Attribution, attribute
 from ident.baseline import DETECTION_EXCESS, discrepancy_p_value
 from ident.diagnosis import diagnose
 from ident.evidence import LAW_ERROR, TEMPER, TEMPER_OF_NOISE, Candidate, model_error, weigh
-from ident.faint import LINEAR, ROUGH, SEEN, SHADOW, by_noise_alone, faint_scores, hidden, in_signal, left_by_laws, seen
+from ident.faint import (
+    LEAST_LATE,
+    LINEAR,
+    ROUGH,
+    SEEN,
+    SHADOW,
+    by_noise_alone,
+    faint_scores,
+    hidden,
+    in_signal,
+    left_by_laws,
+    of_timing,
+    seen,
+)
 from ident.hypotheses import catalogue
 from ident.model import Effect, along_record, as_loop
 from ident.noise import NO_CHANCE, TOGETHER, drifting, line_coherence
@@ -110,6 +123,22 @@ def test_errors_of_a_law_show_at_its_own_joint_first(identified, hypotheses, eff
     assert allowed[h.joint] == SHADOW
     assert np.delete(allowed, h.joint) == pytest.approx(share)
     assert left_by_laws(replace(baseline, costs=costs), told) == pytest.approx(SHADOW * told)
+
+
+@pytest.mark.parametrize(
+    ("effect", "samples", "expected"),
+    [
+        ("torque_delay", 0.5 * LEAST_LATE, True),
+        ("sensor_lag", 0.5 * LEAST_LATE, True),
+        ("torque_delay", 2.0 * LEAST_LATE, False),
+        ("coulomb_friction", 0.5 * LEAST_LATE, False),
+    ],
+)
+def test_a_delay_within_the_error_of_the_timing_is_none(hypotheses, effect, samples, expected):
+    h = next(h for h in hypotheses if h.effect == effect)
+    score = Score(h, 100.0, 1, np.array([samples * 1e-3]), np.ones(1), ())
+    assert of_timing(score, 1e-3) is expected
+    assert not of_timing(replace(score, start=None), 1e-3)
 
 
 @pytest.mark.slow
