@@ -208,27 +208,29 @@ def explore(
     scores = screen(problem, stage, preds, hypotheses)
     excess = max(stage.cost - stage.count, 1.0)
     answered = bool(scores) and scores[0].gain >= least * excess
-    noise = DETECTION_EXCESS * stage.count
 
-    def started(score: Score) -> Fit | None:
-        fits = [started_at(s) for s in (score, *score.near)]
+    def told(score: Score) -> str:
+        return f"refit: {score.hypothesis.effect} at {score.hypothesis.place}"
+
+    def started(score: Score, of: Problem = problem, at: Fit = stage) -> Fit | None:
+        fits = [started_at(s, of, at) for s in (score, *score.near)]
         return min((r for r in fits if r is not None), key=lambda r: r.cost, default=None)
 
-    def started_at(score: Score) -> Fit | None:
+    def started_at(score: Score, of: Problem, at: Fit) -> Fit | None:
         # A start that has lost the data was a step that is not linear, and a gear that hits one end of its dead band
         # after the other takes minutes to fit. A hinge that stands anywhere begins off them, and what answers best is
         # tried from anywhere.
         anywhere = "hinge" in score.hypothesis.options or score.gain >= scores[0].gain
-        most = np.inf if anywhere else STRONG * (stage.count if stage.chi2_per_dof <= FAINT else stage.cost)
-        model, cost = begin(problem, stage, score)
+        most = np.inf if anywhere else STRONG * (at.count if at.chi2_per_dof <= FAINT else at.cost)
+        model, cost = begin(of, at, score)
         result = (
-            refit(problem, model, stage.weights, stage.remainders, FIRST_STEPS, most, noise)
+            refit(of, model, at.weights, at.remainders, FIRST_STEPS, most, DETECTION_EXCESS * at.count)
             if anywhere or cost <= most
             else None
         )
         if result is not None and turned(result.model.effects[-1]) is not result.model.effects[-1]:
             # On its way to another axis it creeps.
-            return refit(problem, result.model, stage.weights, stage.remainders, FIRST_STEPS) or result
+            return refit(of, result.model, at.weights, result.remainders, FIRST_STEPS) or result
         return result
 
     def finished(result: Fit) -> Fit:
@@ -238,8 +240,22 @@ def explore(
         return either_turn(problem, last, last.model.effects[-1])
 
     def begun(chosen: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
-        fits = workers.map_in_time(started, chosen, lambda s: f"refit: {s.hypothesis.effect} at {s.hypothesis.place}")
+        fits = workers.map_in_time(started, chosen, told)
         return [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
+
+    def begun_on_few(chosen: Sequence[Score]) -> list[tuple[Hypothesis, Fit]]:
+        """Those of many that do best on a few records, begun there."""
+        few = problem if rough else thinned(problem)
+        if few is problem:
+            return begun(chosen)
+        there = on_few(few, stage, 0.0)
+        fits = workers.map_in_time(lambda s: started(s, few, there), chosen, told)
+        ranked = [(s.hypothesis, r) for s, r in zip(chosen, fits, strict=True) if r is not None]
+        ranked = sorted(ranked, key=lambda x: x[1].cost)[:HOPEFUL]
+        whole = workers.map_in_time(
+            lambda x: refit(problem, x[1].model, stage.weights, stage.remainders, FIRST_STEPS), ranked
+        )
+        return [(h, r) for (h, _), r in zip(ranked, whole, strict=True) if r is not None]
 
     chosen = choose(scores) if answered else []
     found = begun(chosen)
@@ -250,10 +266,13 @@ def explore(
     seen = np.setdiff1d(np.arange(len(stage.counts)), list(quiet))
     allowed = (DETECTION_EXCESS - 1.0) * np.sum(stage.counts[seen])
     unclear = (
-        stage.chi2_per_dof <= FAINT and not any(map(has_loop, stage.model.effects)) and left_by(found, seen) > allowed
+        stage.chi2_per_dof <= FAINT
+        and not any(map(has_loop, stage.model.effects))
+        and left_by(found, seen) > allowed
+        and not leaves_at_its_own(found, excess)
     )
     if not problem.motions_alone and (unclear or left_by(found) > bare * excess) and not workers.late:
-        found += begun(hinges_everywhere(problem, preds, scores))
+        found += begun_on_few(hinges_everywhere(problem, preds, scores))
     found = hopeful(found)
     hardly = left_by(found) > (1.0 - HARDLY) * excess
     if not hardly and not (rough and left_by(found) < ANSWERED * excess):
@@ -261,6 +280,16 @@ def explore(
         last = workers.map_in_time(finished, [r for _, r in found])
         found = [(h, new or r) for (h, r), new in zip(found, last, strict=True)]
     return sorted(found, key=lambda x: x[1].cost), scores
+
+
+def leaves_at_its_own(found: Sequence[tuple[Hypothesis, Fit]], excess: float) -> bool:
+    """Whether the best candidate explains most of the ``excess`` of the cost over noise, and leaves more than noise at
+    its own joint alone: what its law lacks, and no hinge, which other joints would show."""
+    if not found:
+        return False
+    h, best = min(found, key=lambda x: x[1].cost)
+    left_at = np.flatnonzero(best.costs > DETECTION_EXCESS * best.counts).tolist()
+    return not h.on_chain and set(left_at) <= {h.joint} and best.cost - best.count < ANSWERED * excess
 
 
 def begin(problem: Problem, stage: Fit, score: Score) -> tuple[Model, float]:

@@ -51,7 +51,19 @@ from ident.refits import polish, refit, reweighted, settled, to_compete, turned,
 from ident.reporting import frf_views, most_affected
 from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
 from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
-from ident.search import DECOYS, PER_EFFECT, REFITS, STRONG, begin, best_named, choose, explore, other_bodies
+from ident.search import (
+    DECOYS,
+    HOPEFUL,
+    PER_EFFECT,
+    REFITS,
+    STRONG,
+    begin,
+    best_named,
+    choose,
+    explore,
+    leaves_at_its_own,
+    other_bodies,
+)
 from ident.seek import left_over
 from ident.strong import OTHER_MOTION, beside_strong, loudest_joint, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
@@ -573,6 +585,44 @@ def test_a_hinge_is_found_across_the_axis_from_which_it_was_sought(identified):
         assert found.value("stiffness") == pytest.approx(2e4, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("place", "elsewhere", "left", "own"),
+    [
+        ("elbow_joint", 1.0, 2.0, True),
+        ("elbow_joint", 1.3, 2.0, False),  # another joint shows it too
+        ("elbow_joint", 1.0, 20.0, False),  # most is left
+        ("flange", 1.0, 2.0, False),
+    ],
+)
+def test_what_the_best_law_leaves_at_its_own_joint_is_no_hinge(identified, named, place, elsewhere, left, own):
+    *_, result = identified
+    h = named["coulomb_friction" if place == "elbow_joint" else "payload", place]
+    costs = result.counts * np.array([1.0, elsewhere, left, 1.0, 1.0, 1.0])
+    found = [(h, replace(result, costs=costs)), (h, replace(result, costs=50.0 * costs))]
+    assert leaves_at_its_own(found, 19.0 * float(result.counts[2])) is own
+    assert not leaves_at_its_own([], 1.0)
+
+
+def test_hinges_are_begun_on_few_records_and_the_best_on_all(identified, named, monkeypatch):
+    _, setup, result = identified
+    problem, few, begun = setup.problem, replace(setup.problem), []
+
+    def told(on, model, *args, **kwargs):
+        begun.append((on is few, model.effects[-1].hypothesis))
+        joint = model.effects[-1].hypothesis.joint
+        return replace(result, model=model, costs=result.costs * (1.0 + 0.1 * joint), converged=True)
+
+    monkeypatch.setattr("ident.search.refit", told)
+    monkeypatch.setattr("ident.search.thinned", lambda problem: few)
+    monkeypatch.setattr("ident.search.on_few", lambda few, at, rho: at)
+    hinges = [h for h in catalogue(problem.structure) if h.effect == "transverse_elasticity"]
+    stage = reweighted(problem, result, result.weights)
+    explore(problem, stage, hinges, np.inf, -1.0, Workers())
+    assert {id(h) for on_few, h in begun if on_few} == {id(h) for h in hinges}
+    on_all = [h for on_few, h in begun if not on_few]
+    assert len(on_all) == HOPEFUL and {h.joint for h in on_all} <= {0, 1, 2}
+
+
 @pytest.mark.parametrize(("tilt", "fits"), [(3.0, [0.0, 3.0]), (0.5, [0.0])])
 def test_a_candidate_that_turned_far_goes_on_before_it_is_compared(identified, named, monkeypatch, tilt, fits):
     _, setup, result = identified
@@ -585,7 +635,7 @@ def test_a_candidate_that_turned_far_goes_on_before_it_is_compared(identified, n
         return replace(result, model=replace(model, effects=(there,)), converged=True)
 
     monkeypatch.setattr("ident.search.refit", told)
-    explore(setup.problem, result, [named["transverse_elasticity", "elbow_joint"]], 0.0, np.inf, Workers())
+    explore(setup.problem, result, [named["transverse_elasticity", "elbow_joint"]], 0.0, np.inf, Workers(), rough=True)
     assert begun == fits
 
 
@@ -819,7 +869,13 @@ def test_an_effect_at_its_bounds_is_none(named):
     assert pointless(Effect(spring, np.array([0.1, -9.9])), 1e4)
     assert not pointless(Effect(spring, np.array([300.0, 1.0])), 1e4)
     soft = named["softening_stiffness", "elbow_joint"]  # as soft as a dead band, it is one
-    assert [pointless(Effect(soft, np.array([share * 1e4, 1e-4])), 1e4) for share in (0.02, 0.3)] == [True, False]
+    shares = (0.02, 0.3, 1.0)  # or as stiff as the gear
+    assert [pointless(Effect(soft, np.array([share * 1e4, 1e-4])), 1e4) for share in shares] == [True, False, True]
+    assert pointless(Effect(soft, np.array([3e3, soft.parameters[1].lower])), 1e4)
+    slip = named["hysteresis", "elbow_joint"]
+    rest = [q.null or q.center for q in slip.parameters[2:]]
+    yields = (slip.parameters[1].lower, 2.0)
+    assert [pointless(Effect(slip, np.array([1e3, y, *rest])), 1e4) for y in yields] == [True, False]
     dip = named["stribeck_friction", "elbow_joint"]  # of a friction that vanishes in motion there is none
     falls = [
         pointless(Effect(dip, np.array([coulomb, 1.0, 0.05, 1e-3, 2.0, 0.0])), 1e4)

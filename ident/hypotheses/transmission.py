@@ -14,6 +14,7 @@ from ident.motion import Motion
 
 ROUNDED = 5.0  # exponent of a hysteresis before the data
 SOFTEST = 0.05  # share of its stiffness that a soft middle keeps at least: with less it is a dead band
+LEAST_SIZE = 1e-8  # rad or N m: of a law that does nothing
 
 
 def hardening_stiffness(joint: int, place: str) -> Hypothesis:
@@ -114,7 +115,7 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
             Parameter(
                 "low_stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=0.8, per_stiffness=True
             ),
-            Parameter("transition", "rad", 1e-9, 1.0, log=True, step=1e-2),
+            Parameter("transition", "rad", 0.1 * LEAST_SIZE, 1.0, log=True, step=1e-2),
         ),
         lambda p, delta, k: kernels.Law(kernels.SOFTENING, float(np.clip(p[0], SOFTEST * k, k)), p[1], k),
         lambda scale: [(f * scale.delta[2],) for f in (0.1, 0.3, 0.7, 1.5)],
@@ -124,7 +125,8 @@ def softening_stiffness(joint: int, place: str) -> Hypothesis:
         variable="delta",
         options={
             "size": lambda s: np.array([0.5 * s.stiffness, 0.5 * s.delta_rms]),
-            "trivial": lambda p, k: p[0] <= 1.02 * SOFTEST * k,
+            # a dead band, or the spring of the gear itself
+            "trivial": lambda p, k: p[0] <= 1.02 * SOFTEST * k or p[0] >= k or p[1] <= LEAST_SIZE,
             "middle": lambda p: (p[1], p[0]),  # rad to either side, and the slope there
             "bends": resized,
         },
@@ -147,7 +149,7 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
         "spring",
         (
             Parameter("stiffness", "N m/rad", 1e-3, 1e12, True, step=1e-2, center=0.3, spread=1.5, per_stiffness=True),
-            Parameter("yield_torque", "N m", 1e-9, 1e7, log=True, step=1e-2),
+            Parameter("yield_torque", "N m", 0.1 * LEAST_SIZE, 1e7, log=True, step=1e-2),
             replace(EXPONENT, center=ROUNDED),
             Parameter(
                 "recoil", "1", 0.0, 1.5, nuisance=True, step=0.05, center=0.0, spread=0.5, null=0.0, reported=True
@@ -163,6 +165,7 @@ def hysteresis(joint: int, place: str) -> Hypothesis:
         options={
             "size": lambda s: np.array([0.4 * s.stiffness, 0.2 * s.stiffness * s.delta_rms, ROUNDED, 0.0, 0.0]),
             "shown": "yield_torque",
+            "trivial": lambda p, k: p[1] <= LEAST_SIZE,
         },
     )
 
