@@ -76,16 +76,21 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         turns: of the encoder in a turn of the joint: the gear ratio where it sits at the motor.
     """
 
+    def wave(p) -> tuple[float, float]:
+        """Amplitude and phase: a sine a sample is half the work of two."""
+        return float(np.hypot(p[0], p[1])), float(np.arctan2(p[1], p[0]))
+
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        measured = motion.q(j)
-        error = np.zeros_like(measured)
-        for _ in range(TRUE_STEPS):
-            q = turns * (measured - error)
-            error = p[0] * np.sin(q) + p[1] * np.cos(q)
+        amplitude, phase = wave(p)
+        angle = turns * motion.q(j) + phase
+        error = amplitude * np.sin(angle)
+        for _ in range(TRUE_STEPS - 1):
+            error = amplitude * np.sin(angle - turns * error)
         return -motion.lines(error)
 
     def slope(p, q: np.ndarray) -> np.ndarray:
-        return 1.0 / (1.0 + turns * (p[0] * np.cos(turns * q) - p[1] * np.sin(turns * q)))
+        amplitude, phase = wave(p)
+        return 1.0 / (1.0 + turns * amplitude * np.cos(turns * q + phase))
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q, unseen = turns * motion.q(j), turns * motion.unseen(j)
