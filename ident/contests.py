@@ -59,7 +59,7 @@ def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: 
     for found in rounds:
         winner = found.candidates[0].hypothesis
         there = {e.hypothesis.key for e in current.model.effects}
-        blurred = len(there) > 1 or outdone(found) or nearly_settled(current, winner)
+        blurred = len(there) > 1 or outdone(found) or nearly_settled(problem, current, winner)
         if blurred and winner.key in there and not winner.decoy and not workers.late:
             current, found = contest(problem, current, found, workers)
         out.append(found)
@@ -86,7 +86,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         e for e in alike(found, winner) if other(e.hypothesis) and all(e.hypothesis is not x.hypothesis for x in rivals)
     ]
     rivals += [*as_load(current, own, others), *elsewhere(problem, current, own, others)]
-    rivals += wider(problem, current, own) if nearly_settled(current, winner) else []
+    rivals += wider(problem, current, own) if nearly_settled(problem, current, winner) else []
 
     enough = to_compete(current.cost, current.count)
 
@@ -209,8 +209,8 @@ def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
     return [Effect(x, clip_to_bounds(x, p)) for x in laws for p in x.options["widens"](effect.p, scale)]
 
 
-def nearly_settled(current: Fit, h: Hypothesis) -> bool:
+def nearly_settled(problem: Problem, current: Fit, h: Hypothesis) -> bool:
     """Whether a little more than noise is left, as a whole or at the joint of a law, so that its shape can be what is
-    missing."""
-    left = not settled(current) or (h.joint >= 0 and unsettled_at(current, h.joint))
+    missing; or the noise itself is what the law has left."""
+    left = problem.noise_left or not settled(current) or (h.joint >= 0 and unsettled_at(current, h.joint))
     return left and current.chi2_per_dof <= FAINT

@@ -288,7 +288,8 @@ def with_noise_that_is_left(dataset: Dataset, problem: Problem, result: Fit) -> 
     if np.all(LOUD * power > 1.0):
         return problem
     lowered = np.maximum(problem.tau_std * np.sqrt(power), least_noise(dataset, "tau"))
-    return replace(problem, tau_std=np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(lowered, problem.tau_std)))
+    lowered = np.where(LOUD * power > 1.0, problem.tau_std, np.minimum(lowered, problem.tau_std))
+    return replace(problem, tau_std=lowered, noise_left=True)
 
 
 def left_at_lines(problem: Problem, result: Fit) -> tuple[list[np.ndarray], list[np.ndarray]]:

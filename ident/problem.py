@@ -34,6 +34,7 @@ class Problem:
             None.
         scatter_share: of what the scatter between periods says that noise adds to costs, that is taken off where these
             are compared; that which the baseline has borne, none before it is known.
+        noise_left: whether ``tau_std`` is what a model has left: errors of its laws are in it.
     """
 
     structure: Structure
@@ -45,6 +46,7 @@ class Problem:
     free_timing: bool = True
     scatter_share: float = 0.0
     start: Parameters | None = None
+    noise_left: bool = False
 
     @property
     def begun(self) -> Parameters:

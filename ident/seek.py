@@ -80,7 +80,7 @@ def seek(
         return replace(linked, late=workers.late)
     foretell = not mislabelled and setup.problem.motions_alone and inertias_foretell(setup)
     first_search = workers.for_half() if foretell else workers  # causes are then sought beside these inertias too
-    setup, baseline, result = sought(dataset, setup, baseline, max_causes, first_search)
+    setup, baseline, result = sought(dataset, setup, baseline, max_causes, workers, first_search)
     if linked is not None and linked.result.detected and not result.detected:
         return replace(linked, late=linked.late or first_search.late)
     found = Sought(setup, recorded, baseline, result, setup.problem.nominal, late=first_search.late)
@@ -90,12 +90,16 @@ def seek(
 
 
 def sought(
-    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
+    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers, first: Workers | None = None
 ) -> tuple[Setup, Fit, Attribution]:
     """Causes of what the baseline leaves; once more where beside these the noise turns out to be far more or far less
-    than was guessed, or that the arm still swung."""
-    found = under_noise_seen(dataset, *beside_steps(setup, baseline, max_causes, workers), max_causes, workers)
-    return beside_steady_records(*found, max_causes, workers)
+    than was guessed, or that the arm still swung.
+
+    Args:
+        first: those of the search under the noise that was guessed; ``workers`` where None.
+    """
+    found = beside_steps(setup, baseline, max_causes, first or workers)
+    return beside_steady_records(*under_noise_seen(dataset, *found, max_causes, workers), max_causes, workers)
 
 
 def beside_steps(setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
