@@ -8,7 +8,8 @@ lines no more than a tenth more of that (score test, Rao 1948; theory.md 9.3).
 Where the scatter between periods does not say how the noise is spread over the lines, what noise alone explains is told
 by what is left itself with its phases drawn anew, all joints of a line together: of the same spectrum and correlation,
 and no response. Where it does, what the periods differ by tells whether the noise of lines and joints goes together, as
-that of a clock that wanders does: then a few numbers explain much of it too, and nothing is told.
+that of a clock that wanders does: then a few numbers explain much of it too, and nothing is told. The noise of positions
+is in what they answer as well as in what is left: what it explains by that is told by drawing it anew.
 """
 
 from __future__ import annotations
@@ -59,14 +60,14 @@ def hidden(
         trial each).
     """
     scores = faint_scores(problem, current, hypotheses, told)
-    clear = seen(scores, current)
+    clear, asked = beyond_noise_of_positions(problem, current, scores)
     if clear is None:
         return (), 1.0
     explained = by_noise_alone(problem, current, hypotheses)
     if explained > (SEEN if scatter_is_seen(problem) else clear.gain / BY_PHASES):
         return (), 1.0
     chance = min(1.0, len(scores) * scipy.stats.chi2.sf(clear.gain, clear.dof))
-    return tuple(s.hypothesis for s in scores if s.gain >= LINEAR * clear.gain), float(chance)
+    return tuple(s.hypothesis for s in asked), float(chance)
 
 
 def faint_scores(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis], told: np.ndarray) -> list[Score]:
@@ -144,6 +145,56 @@ def by_noise_alone(problem: Problem, current: Fit, hypotheses: Sequence[Hypothes
         for _ in range(DRAWS)
     )
     return max(screen(drawn, current, preds, hypotheses)[0].gain for drawn in draws)
+
+
+def beyond_noise_of_positions(
+    problem: Problem, current: Fit, scores: Sequence[Score]
+) -> tuple[Score | None, list[Score]]:
+    """The clearest score that the noise of positions does not explain, and those that come near it."""
+    left, of_noise = list(scores), dict[int, float]()
+    while (clear := seen(left, current)) is not None:
+        asked = [s for s in left if s.gain >= LINEAR * clear.gain]
+        new = [s.hypothesis for s in asked if id(s.hypothesis) not in of_noise]
+        if new:
+            of_noise |= by_noise_of_positions(problem, current, new)
+        beyond = [s for s in asked if s.gain > BY_PHASES * of_noise[id(s.hypothesis)]]
+        if any(s is clear for s in beyond):
+            return clear, beyond
+        left = [s for s in left if s.gain < LINEAR * clear.gain or any(s is x for x in beyond)]
+    return None, []
+
+
+def by_noise_of_positions(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> dict[int, float]:
+    """What each hypothesis, by ``id``, explains of noise that the positions along which it is asked hold too: the most
+    in a few draws.
+
+    A joint that hardly moves in a record answers a linear hypothesis with its noise, which is in the residual as well:
+    both go together in all records, however many there are.
+    """
+    rng, most = np.random.default_rng(DRAWS), dict.fromkeys(map(id, hypotheses), 0.0)
+    for _ in range(DRAWS):
+        moved = [with_noise_drawn_anew(group, rng) for group in problem.groups]
+        drawn = replace(problem, groups=tuple(group for group, _, _ in moved))
+        preds = predictions(drawn, current.model, current.remainders)
+        groups = tuple(
+            replace(g, U=p.U + torque - np.einsum("lij,slj->sli", p.sampled_impedance, position))
+            for (g, torque, position), p in zip(moved, preds, strict=True)
+        )
+        for score in screen(replace(problem, groups=groups), current, preds, hypotheses):
+            most[id(score.hypothesis)] = max(most[id(score.hypothesis)], score.gain)
+    return most
+
+
+def with_noise_drawn_anew(group: Group, rng: np.random.Generator) -> tuple[Group, np.ndarray, np.ndarray]:
+    """A group whose positions hold other noise, and noise of its torques and that of these positions; (S, L, n)."""
+
+    def drawn(variance: np.ndarray) -> np.ndarray:
+        both = rng.normal(size=(2, *group.U.shape)) * np.sqrt(0.5 * variance)
+        both[:, :, 0] = 0.0
+        return both[0] + 1j * both[1]
+
+    torque, position = drawn(group.torque_noise), drawn(group.position_noise)
+    return replace(group, Q=group.signal_share * group.Q + position), torque, position
 
 
 def with_other_phases(group: Group, prediction: Prediction, rng: np.random.Generator) -> Group:

@@ -18,6 +18,7 @@ from ident.faint import (
     ROUGH,
     SEEN,
     SHADOW,
+    beyond_noise_of_positions,
     by_noise_alone,
     faint_scores,
     hidden,
@@ -193,6 +194,43 @@ def test_nothing_faint_is_sought_beside_link_encoders(identified, hypotheses):
     problem = setup.problem
     linked = replace(problem, groups=(replace(problem.groups[0], links=(1,)), *problem.groups[1:]))
     assert faint_scores(linked, baseline, hypotheses, np.zeros(6)) == []
+
+
+@pytest.mark.parametrize(("still", "found"), [(True, False), (False, True)])
+def test_the_noise_of_a_joint_that_hardly_moves_is_no_answer_of_it(identified, hypotheses, still, found):
+    """A damper at the link: with its own noise for its motion it explains the noise that this leaves in the torque; in
+    motion, what it does."""
+    _, setup, baseline = identified
+    j, rng = 3, np.random.default_rng(1)
+    drag = next(h for h in hypotheses if h.effect == "unknown:link_friction" and h.joint == j)
+    groups = []
+    for group in setup.problem.groups:
+        Q = group.Q.copy()
+        Q[:, 1:, j] *= not still
+        group = single(
+            replace(group, Q=Q, white_noise=group.white_noise * np.where(still & (np.arange(6) == j), 1e4, 1.0))
+        )
+        noise = (rng.normal(size=(2, *Q.shape)) * np.sqrt(0.5 * group.position_noise))[:, :, :, j]
+        noise[:, :, 0] = 0.0
+        Q[..., j] += (noise[0] + 1j * noise[1]) * still
+        groups.append(replace(group, Q=Q))
+    problem = replace(setup.problem, groups=tuple(groups))
+    effect = () if still else (Effect(drag, np.array([0.3])),)
+    true = replace(baseline.model, effects=effect)
+    preds = predictions(problem, true, baseline.remainders)
+    passed = [
+        np.einsum("li,sl->sli", p.sampled_impedance[..., j], g.Q[..., j]) * still
+        for g, p in zip(problem.groups, preds, strict=True)
+    ]
+    for U in passed:
+        U[:, 0] = 0.0
+    problem = replace(
+        problem, groups=tuple(replace(g, U=p.U - U) for g, p, U in zip(groups, preds, passed, strict=True))
+    )
+    quiet = replace(baseline, costs=baseline.counts.astype(float))
+    scores = faint_scores(problem, quiet, [drag], np.zeros(6))
+    assert seen(scores, quiet) is not None
+    assert (beyond_noise_of_positions(problem, quiet, scores)[0] is not None) is found
 
 
 @pytest.mark.slow
