@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.baseline import DETECTION_EXCESS, FAINT, implausible
+from ident.baseline import DETECTION_EXCESS, FAINT, bent, implausible
 from ident.evidence import (
     LAW_ERROR,
     TEMPER,
@@ -130,7 +130,8 @@ def attribute_once(
     found, scores = explore(problem, current, hypotheses, least, bare, workers, quiet=quiet)
     excess = max(current.cost - current.count, 1.0)
     told = bool(found) and settles_its_joint(problem, current, *found[0])
-    if current.chi2_per_dof > STRONG and left_by(found) > SETTLED * excess and not told and not workers.late:
+    spoilt = current.chi2_per_dof > STRONG or (current.chi2_per_dof > FAINT and bent(problem, current))
+    if spoilt and left_by(found) > SETTLED * excess and not told and not workers.late:
         before, found, scores, softly = explore_softly(problem, current, found, hypotheses, workers)
     best: dict[int, tuple[Hypothesis, Fit]] = {}
     for h, result in found:
@@ -151,15 +152,14 @@ def leaves_much(problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis
     That is anything clearly above the noise where the drives cannot be those of the arm, or where the arm may have
     several steady motions under the law of the best; else more than what is faint, and than errors of its law.
     """
-    bent = bool(ranked) and "bends" in ranked[0][0].options
-    return min(before.cost - before.count, left_by(ranked)) > allowed_to_stay(problem, before, bent)
+    bends = bool(ranked) and "bends" in ranked[0][0].options
+    return min(before.cost - before.count, left_by(ranked)) > allowed_to_stay(problem, before, bends)
 
 
-def allowed_to_stay(problem: Problem, before: Fit, bent: bool) -> float:
-    """Excess over noise that the best candidate may leave with no strong effect missing; ``bent``: by its law the arm
-    may have
-    several steady motions."""
-    spoilt = not problem.motions_alone and (bent or implausible(problem, before))
+def allowed_to_stay(problem: Problem, before: Fit, bends: bool) -> float:
+    """Excess over noise that the best candidate may leave with no strong effect missing; ``bends``: by its law the arm
+    may have several steady motions."""
+    spoilt = not problem.motions_alone and (bends or implausible(problem, before))
     return SPOILT * before.count if spoilt else max(FAINT * before.count, LAW_ERROR * (before.cost - before.count))
 
 

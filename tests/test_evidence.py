@@ -49,7 +49,17 @@ from ident.problem import Weights, data_counts, predictions
 from ident.pruning import plainly_special, pruned, renamed, without_shadows
 from ident.refits import polish, refit, reweighted, settled, to_compete, turned, under_own_noise
 from ident.reporting import frf_views, most_affected
-from ident.rounds import Round, leaves_much, left_share, next_answers, outdone, settles_its_joint, shadows, with_name
+from ident.rounds import (
+    Round,
+    attribute_once,
+    leaves_much,
+    left_share,
+    next_answers,
+    outdone,
+    settles_its_joint,
+    shadows,
+    with_name,
+)
 from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
 from ident.search import (
     DECOYS,
@@ -1600,6 +1610,22 @@ def test_the_best_law_that_leaves_noise_alone_ends_the_search_for_strong_ones(id
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("chi2", "led_away", "softly"), [(10.0, True, True), (10.0, False, False), (2.0, True, False), (40.0, False, True)]
+)
+def test_candidates_are_sought_softly_where_much_is_left_or_the_drives_are_led_away(
+    identified, monkeypatch, chi2, led_away, softly
+):
+    _, setup, baseline = identified
+    result, asked = replace(baseline, costs=chi2 * baseline.counts), []
+    monkeypatch.setattr("ident.rounds.bent", lambda problem, current: led_away)
+    monkeypatch.setattr("ident.rounds.explore", lambda *args, **kwargs: ([], []))
+    monkeypatch.setattr("ident.rounds.explore_softly", lambda *args: asked.append(args) or (result, [], [], {}))
+    monkeypatch.setattr("ident.rounds.beside_strong", lambda problem, before, ranked, *args: (before, ranked))
+    assert not attribute_once(setup.problem, result, (), Workers(), 0.0, 0.0).candidates
+    assert bool(asked) is softly
+
+
 @pytest.mark.parametrize(("bent", "left", "joints"), [
     (True, 50.0, {0, 1, 2, 3, 4, 5}),
     (False, 50.0, {2, 4}),  # drives that can be those of the arm
