@@ -127,7 +127,8 @@ def _with_figures(
     entries: list[dict[str, Any]], table: str, given: dict[str, Any], figures: dict[str, tuple[str, ...]], where: str
 ) -> list[dict[str, Any]]:
     """Figures of a table for all joints, as ``[noise]`` of a dataset, given to those that have none of their own."""
-    if given and _all(list(given.values()), dict):
+    names = [entry.get("name") for entry in entries]
+    if _all(list(given.values()), dict) and any(name in names for name in given):
         return _with_own(entries, table, given, figures, where)
     for figure, others in figures.items():
         used = [key for key in (*names_of(figure), *others) if key in given]
@@ -151,12 +152,12 @@ def _with_own(
     entries: list[dict[str, Any]], table: str, given: dict[str, Any], figures: dict[str, tuple[str, ...]], where: str
 ) -> list[dict[str, Any]]:
     """The same of a table that has one of each joint, by its name."""
-    names = [entry.get("name") for entry in entries]
+    names = [str(entry.get("name")) for entry in entries]
     strange = [name for name in given if name not in names]
     if strange:
         raise DataError(f"[{table}.{strange[0]}]", where, show(strange[0]), f"one of the joints {names}")
     return [
-        _with_figures([entry], table, given.get(str(name), {}), figures, where)[0]
+        _with_figures([entry], table, given.get(name, {}), figures, where)[0]
         for name, entry in zip(names, entries, strict=True)
     ]
 

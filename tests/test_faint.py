@@ -166,10 +166,10 @@ def test_noise_whose_lines_go_together_shows_nothing(identified, hypotheses):
         return replace(group, U_periods=U_periods, U=U_periods.mean(axis=1))
 
     problem = replace(setup.problem, groups=tuple(map(recorded, setup.problem.groups)))
-    seen_at_all = seen(faint_scores(problem, baseline, hypotheses, np.zeros(6)), baseline)
-    assert seen_at_all is not None
-    assert by_noise_alone(setup.problem, baseline, hypotheses) < SEEN < by_noise_alone(problem, baseline, hypotheses)
-    assert hidden(problem, baseline, hypotheses, np.zeros(6)) == ((), 1.0)
+    some = [h for h in hypotheses if "friction" in h.effect and h.joint < 3]
+    assert seen(faint_scores(problem, baseline, some, np.zeros(6)), baseline) is not None
+    assert by_noise_alone(setup.problem, baseline, some) < SEEN < by_noise_alone(problem, baseline, some)
+    assert hidden(problem, baseline, some, np.zeros(6)) == ((), 1.0)
 
 
 def test_linear_hypotheses_are_seen_at_lines_that_hold_signal(identified, hypotheses):

@@ -175,7 +175,7 @@ def test_limits_and_noise_may_have_a_table_of_each_joint(tmp_path):
         (f"{DRIVES}[load]\n{LOAD}[[loads]]\n{LOAD}", "[[load]] beside it"),
         (f"{DRIVES}[limits]\neffort = [1.0]", "[1.0]"),
         (f"{DRIVES}[limits]\neffort = 1.0\ntorque_max = 1.0", "torque_max beside it"),
-        (f"{DRIVES}[limits.wrist]\neffort = 1.0", "[limits.wrist]"),
+        (f"{DRIVES}[limits.elbow]\neffort = 1.0\n[limits.wrist]\neffort = 1.0", "[limits.wrist]"),
         (f'{LISTED}[[drive]]\njoint = "shoulder"\n{EACH[0]}', "drives of ['shoulder']"),
         (LISTED + f'[[drive]]\njoint = "elbow"\n{EACH[0]}' * 2, "drives of ['elbow', 'elbow']"),
         (f"{LISTED}[[drive]]\n{EACH[0]}[[joint]]\n{EACH[1]}", "[[joint]] beside it"),
