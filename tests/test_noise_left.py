@@ -9,7 +9,9 @@ import pytest
 import scipy.signal
 
 from ident.baseline import fit_baseline
+from ident.contests import nearly_settled
 from ident.diagnosis import diagnose
+from ident.hypotheses import catalogue
 from ident.identification import (
     identify,
     set_up,
@@ -162,9 +164,29 @@ def test_noise_of_the_torque_is_found_where_that_of_positions_reaches_all_joints
     data = replace(data, segments=tuple(last))  # the transient tells it otherwise
     true = locked.array("tau_std")
     problem = replace(set_up(data).problem, tau_std=10.0 * true)
-    found = with_noise_that_is_left(data, problem, fit_baseline(problem)).tau_std
+    lowered = with_noise_that_is_left(data, problem, fit_baseline(problem))
+    found = lowered.tau_std
+    assert lowered.noise_left and not problem.noise_left
     assert np.all(found > 0.8 * true)
     assert np.all(found < 2.5 * true)
+
+
+@pytest.mark.parametrize(("left", "chi2", "expected"), [(True, 1.0, True), (False, 1.0, False), (True, 10.0, False)])
+def test_a_law_is_widened_where_the_noise_is_what_it_has_left(identified, left, chi2, expected):
+    """An error of the law is in that noise, and all is within it."""
+    _, setup, baseline = identified
+    problem, fit = replace(setup.problem, noise_left=left), replace(baseline, costs=chi2 * baseline.counts)
+    assert nearly_settled(problem, fit, catalogue(problem.structure)[0]) is expected
+
+
+def test_causes_are_sought_again_with_the_time_of_the_whole_search(monkeypatch):
+    """The first search has half of it where inertias are sought too."""
+    first, whole, given = Workers(), Workers(), []
+    monkeypatch.setattr("ident.seek.beside_steps", lambda *args: given.append(args[-1]) or (None, None, None))
+    monkeypatch.setattr("ident.seek.under_noise_seen", lambda *args: given.append(args[-1]) or (None, None, None))
+    monkeypatch.setattr("ident.seek.beside_steady_records", lambda *args: given.append(args[-1]))
+    sought(None, None, None, 4, whole, first)
+    assert [w is first for w in given] == [True, False, False] and given[1] is given[2] is whole
 
 
 @pytest.mark.parametrize("coloured", [pytest.param(False, marks=pytest.mark.slow), True])
