@@ -27,7 +27,7 @@ from ident.hypotheses import Hypothesis
 from ident.model import has_rough_law, is_along_record, is_linear
 from ident.noise import drifting
 from ident.problem import Problem, predictions
-from ident.screening import Score, screen
+from ident.screening import Score, most_explained, screen
 from ident.torque_fit import Fit
 
 SEEN = 32.0  # fall of the cost in a linear step, over the noise, from which a faint cause is sought
@@ -140,11 +140,11 @@ def by_noise_alone(problem: Problem, current: Fit, hypotheses: Sequence[Hypothes
     """What the best of all hypotheses explains of noise like that of the records: the most in a few draws."""
     preds = predictions(problem, current.model, current.remainders)
     draw, rng = with_other_scatter if scatter_is_seen(problem) else with_other_phases, np.random.default_rng(DRAWS)
-    draws = (
+    draws = [
         replace(problem, groups=tuple(draw(g, p, rng) for g, p in zip(problem.groups, preds, strict=True)))
         for _ in range(DRAWS)
-    )
-    return max(screen(drawn, current, preds, hypotheses)[0].gain for drawn in draws)
+    ]
+    return float(np.max(most_explained(problem, current, preds, hypotheses, draws)))
 
 
 def beyond_noise_of_positions(

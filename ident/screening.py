@@ -56,7 +56,7 @@ def signal_scale(
     problem: Problem, predictions: Sequence[Prediction], joint: int, wave_numbers: tuple[float, ...]
 ) -> SignalScale:
     """Sizes of a joint's signals over all records."""
-    v, q, delta, torque, res, sizes = [], [], [], [], [], []
+    v, q, delta, torque, sizes = [], [], [], [], []
     starts, tops = [], []
     for group, pred in zip(problem.groups, predictions, strict=True):
         motion = pred.motion()
@@ -67,8 +67,6 @@ def signal_scale(
         u = motion.torque(joint)
         torque.append(np.mean((u - u.mean(axis=1, keepdims=True)) ** 2))
         sizes.append(motion.torque_sizes(joint).ravel())
-        r = group.to_time((group.U - pred.U)[..., joint : joint + 1])
-        res.append(np.mean(r**2))
         starts += [*group.start, *(group.start + group.period_time)]
         tops.append(group.omega[group.n_compared - 1] / 2 / np.pi)
     all_delta, all_sizes = np.concatenate(delta), np.concatenate(sizes)
@@ -78,7 +76,6 @@ def signal_scale(
         delta=np.quantile(all_delta, [0.1, 0.5, 0.9, 0.995]),
         delta_rms=float(np.sqrt(np.mean(all_delta**2))),
         torque=float(np.sqrt(np.mean(torque))),
-        residual=float(np.sqrt(np.mean(res))),
         stiffness=float(predictions[0].par.stiffness[joint]),
         wave_numbers=wave_numbers,
         peak_torque=float(np.max(all_sizes)),
@@ -98,21 +95,51 @@ def screen(
         lambda j: signal_scale(problem, predictions, j, wave_numbers(problem, predictions, j)),
         range(problem.structure.n),
     )
+    found = map_threads(lambda members: _best_scores(stage, members, scales), side_by_side(hypotheses))
+    return sorted((score for part in found for score in part), key=lambda s: -s.gain)
+
+
+@one_thread_each
+def most_explained(
+    problem: Problem,
+    fit: Fit,
+    predictions: Sequence[Prediction],
+    hypotheses: Sequence[Hypothesis],
+    others: Sequence[Problem],
+) -> np.ndarray:
+    """Gain of the best of all hypotheses in each of ``others``: the same motions with other torques; (R,).
+
+    The unit responses are those of the motions, and made once for all of them; ripples are asked at the wave numbers
+    that any of them shows.
+    """
+    stage = _Stage.build(problem, fit, predictions, others)
+
+    def scale(joint: int) -> SignalScale:
+        waves = (wave_numbers(other, predictions, joint) for other in others)
+        return signal_scale(problem, predictions, joint, tuple(dict.fromkeys(n for each in waves for n in each)))
+
+    scales = map_threads(scale, range(problem.structure.n))
+    each = map_threads(lambda members: _best_gains(stage, members, scales), side_by_side(hypotheses))
+    return np.max(each, axis=0)
+
+
+def side_by_side(hypotheses: Sequence[Hypothesis]) -> list[list[Hypothesis]]:
+    """Hypotheses by what they are scored with: all of one channel and joint, or a single one of the chain."""
     together: dict[tuple, list[Hypothesis]] = {}
     for h in hypotheses:
         together.setdefault(h.key if h.channel == "model" else (h.channel, h.joint), []).append(h)
-    found = map_threads(lambda members: _best_scores(stage, members, scales), together.values())
-    return sorted((score for part in found for score in part), key=lambda s: -s.gain)
+    return list(together.values())
 
 
 @dataclass(frozen=True)
 class _Stage:
-    """What all hypotheses are held against: whitened residual, fitted coordinates, inverse of their normal matrix.
+    """What all hypotheses are held against: whitened residuals, fitted coordinates, inverse of their normal matrix.
 
     ``damped`` is that inverse with what is known of the coordinates beforehand, for steps.
 
-    ``residuals`` (S, K, n), ``columns`` (S, K, n, p) and ``moved`` (S, K, n, joints) per group, complex; the last is
-    what a constant unit torque in a gear does by the posture to which it moves the arm, none for motions.
+    ``residuals`` (S, K, n, R), ``columns`` (S, K, n, p) and ``moved`` (S, K, n, joints) per group, complex; the last is
+    what a constant unit torque in a gear does by the posture to which it moves the arm, none for motions. ``moment``
+    (p, R). There are R records of the same motions, one where they are not drawn anew.
     """
 
     problem: Problem
@@ -127,7 +154,11 @@ class _Stage:
     damped: np.ndarray
 
     @classmethod
-    def build(cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction]) -> _Stage:
+    def build(
+        cls, problem: Problem, fit: Fit, predictions: Sequence[Prediction], others: Sequence[Problem] = ()
+    ) -> _Stage:
+        """Args: others: records of the same motions that take the place of those of ``problem``."""
+
         def whitened(g: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
             group, pred = problem.groups[g], predictions[g]
             J = fit.weights.apply(
@@ -136,12 +167,13 @@ class _Stage:
             moved = None
             if group.window is None:
                 moved = fit.weights.apply(g, group.observe_outputs(moved_by_gears(pred)))
-            return fit.weights.apply(g, output_error(group, pred)), J, moved
+            errors = [output_error(of.groups[g], pred) for of in others or (problem,)]
+            return np.stack([fit.weights.apply(g, error) for error in errors], axis=-1), J, moved
 
         residuals, columns, moved = zip(*map_threads(whitened, range(len(problem.groups))), strict=True)
         real = [as_real(J) for J in columns]
         H = sum(J.T @ J for J in real)
-        moment = sum(J.T @ as_real(r[..., None])[:, 0] for J, r in zip(real, residuals, strict=True))
+        moment = sum(J.T @ as_real(r) for J, r in zip(real, residuals, strict=True))
         size = np.sqrt(np.maximum(np.diag(H), 1e-30))
         inverse = np.linalg.pinv(H / np.outer(size, size), rcond=1e-10, hermitian=True) / np.outer(size, size)
         _, prior = prior_of(problem, fit.model)
@@ -152,55 +184,74 @@ class _Stage:
 
 @dataclass(frozen=True)
 class _Sums:
-    """Inner products of unit responses among themselves (m, m), with the residual (m,) and with the
+    """Inner products of unit responses among themselves (m, m), with the residuals (m, R) and with the
     fitted coordinates (p, m)."""
 
     own: np.ndarray
-    residual: np.ndarray
+    residuals: np.ndarray
     columns: np.ndarray
 
     def __add__(self, other: _Sums) -> _Sums:
-        return _Sums(self.own + other.own, self.residual + other.residual, self.columns + other.columns)
+        return _Sums(self.own + other.own, self.residuals + other.residuals, self.columns + other.columns)
 
 
 @dataclass(frozen=True)
 class _Field:
     """How a torque signal of one channel shows in a group: whitened torque per signal, (K, n).
 
-    ``residual`` (S, K) and ``columns`` (S, K, p) are the stage seen along it, so that a signal costs
+    ``residuals`` (S, K, R) and ``columns`` (S, K, p) are the stage seen along it, so that a signal costs
     no more than its own lines. Its mean also moves the arm to another posture, where it answers all lines otherwise:
-    ``moved`` (S, K, n) per unit of the mean, ``moved_residual`` (S,) and ``moved_columns`` (S, p) the stage seen along
-    that; nothing of motors and drives.
+    ``moved`` (S, K, n) per unit of the mean, ``moved_residuals`` (S, R) and ``moved_columns`` (S, p) the stage seen
+    along that; nothing of motors and drives.
     """
 
     torque: np.ndarray
-    residual: np.ndarray
+    residuals: np.ndarray
     columns: np.ndarray
     moved: np.ndarray
-    moved_residual: np.ndarray
+    moved_residuals: np.ndarray
     moved_columns: np.ndarray
 
     @classmethod
     def build(cls, stage: _Stage, g: int, channel: str, joint: int) -> _Field:
         group, pred = stage.problem.groups[g], stage.predictions[g]
         torque = stage.fit.weights.apply(g, _gain(pred, channel, joint)[None, : group.n_compared])[0]
-        residual = np.einsum("kn,skn->sk", torque.conj(), stage.residuals[g])
-        columns = np.matmul(torque.conj()[:, None, :], stage.columns[g])[..., 0, :]
+        residuals, columns = (
+            np.matmul(torque.conj()[:, None, :], x)[..., 0, :] for x in (stage.residuals[g], stage.columns[g])
+        )
         moved = stage.moved[g] @ _share_of_gears(pred, channel, joint)
         seen = moved.conj().reshape(len(moved), 1, -1)
-        moved_columns = np.matmul(seen, stage.columns[g].reshape(len(moved), -1, columns.shape[-1]))[:, 0].real
-        moved_residual = np.matmul(seen, stage.residuals[g].reshape(len(moved), -1, 1))[:, 0, 0].real
-        return cls(torque, residual, columns, moved, moved_residual, moved_columns)
+        moved_residuals, moved_columns = (
+            np.matmul(seen, x.reshape(len(moved), -1, x.shape[-1]))[:, 0].real
+            for x in (stage.residuals[g], stage.columns[g])
+        )
+        return cls(torque, residuals, columns, moved, moved_residuals, moved_columns)
 
 
-def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequence[SignalScale]) -> list[Score]:
-    """The best shape of each hypothesis; all of one channel and joint, or a single one of the chain."""
+def _fields(stage: _Stage, hypotheses: Sequence[Hypothesis]) -> list[dict[str, _Field]]:
+    """By group and channel, of hypotheses of ``side_by_side``; none of motions."""
     channels = {hypotheses[0].channel, "motor"} - {"model"}
     joint = hypotheses[0].joint
-    fields = [
+    return [
         {c: _Field.build(stage, g, c, joint) for c in channels} if group.window is None else {}
         for g, group in enumerate(stage.problem.groups)
     ]
+
+
+def _best_gains(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequence[SignalScale]) -> np.ndarray:
+    """Gain (R,) of the best shape of all hypotheses of ``side_by_side``."""
+    fields, best = _fields(stage, hypotheses), np.zeros(stage.moment.shape[1])
+    for h in hypotheses:
+        for shape in h.shapes(scales[max(h.joint, 0)]):
+            explained = _explained(stage, _unit_responses(stage, fields, h, shape)[0])
+            if explained is not None:
+                best = np.maximum(best, explained[1])
+    return best
+
+
+def _best_scores(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequence[SignalScale]) -> list[Score]:
+    """The best shape of each of the hypotheses of ``side_by_side``."""
+    fields = _fields(stage, hypotheses)
     best = []
     for h in hypotheses:
         tried = [_score(stage, fields, h, shape) for shape in h.shapes(scales[max(h.joint, 0)])]
@@ -242,6 +293,31 @@ def other_waves(best: Score, others: Sequence[Score], orders: Sequence[float] = 
 
 
 def _score(stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, shape: tuple[float, ...]) -> Score | None:
+    sums, start = _unit_responses(stage, fields, h, shape)
+    explained = _explained(stage, sums)
+    if explained is None:
+        return None
+    c, gain = explained[0][:, 0], float(explained[1][0])
+    step = stage.damped @ (stage.moment[:, 0] - sums.columns @ c)
+    return Score(h, gain, len(c), _start(start, c, h, shape, stage.problem), c, shape, step)
+
+
+def _explained(stage: _Stage, sums: _Sums) -> tuple[np.ndarray, np.ndarray] | None:
+    """Weights (m, R) of unit responses in a linear step, and the fall of the cost (R,); None where they are not
+    finite."""
+    size = np.sqrt(np.maximum(np.diag(sums.own), 1e-300))
+    P = (sums.own - sums.columns.T @ stage.inverse @ sums.columns) / np.outer(size, size)
+    y = (sums.residuals - sums.columns.T @ stage.inverse @ stage.moment) / size[:, None]
+    if not (np.all(np.isfinite(P)) and np.all(np.isfinite(y))):
+        return None
+    weights = np.linalg.pinv(P, rcond=1e-9, hermitian=True) @ y
+    return weights / size[:, None], np.sum(y * weights, axis=0)
+
+
+def _unit_responses(
+    stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, shape: tuple[float, ...]
+) -> tuple[_Sums, Callable[[np.ndarray], np.ndarray | None]]:
+    """Sums of the unit responses of a hypothesis over all groups, and what makes a start of their weights."""
     total = None
     start: Callable[[np.ndarray], np.ndarray | None] = h.options.get("start", lambda c: None)
     for g, (group, pred) in enumerate(zip(stage.problem.groups, stage.predictions, strict=True)):
@@ -263,17 +339,8 @@ def _score(stage: _Stage, fields: Sequence[dict[str, _Field]], h: Hypothesis, sh
                 along = [_along_motion(stage, g, c, h.joint, X) for c, X in parts]
                 sums = _whole_sums(stage, g, sum(along, np.zeros_like(along[0])))
         total = sums if total is None else total + sums
-    if total is None:
-        return None
-    size = np.sqrt(np.maximum(np.diag(total.own), 1e-300))
-    P = (total.own - total.columns.T @ stage.inverse @ total.columns) / np.outer(size, size)
-    y = (total.residual - total.columns.T @ stage.inverse @ stage.moment) / size
-    if not (np.all(np.isfinite(P)) and np.all(np.isfinite(y))):
-        return None
-    weights = np.linalg.pinv(P, rcond=1e-9, hermitian=True) @ y
-    c = weights / size
-    step = stage.damped @ (stage.moment - total.columns @ c)
-    return Score(h, float(y @ weights), len(c), _start(start, c, h, shape, stage.problem), c, shape, step)
+    assert total is not None  # there is a group
+    return total, start
 
 
 def _along_motion(stage: _Stage, g: int, channel: str, joint: int, signals: np.ndarray) -> np.ndarray:
@@ -314,14 +381,15 @@ def _whole_sums(stage: _Stage, g: int, units: np.ndarray, wound: np.ndarray | No
     if wound is not None and moved is not None:
         X = X + np.einsum("skoj,sjm->skom", moved, wound)
     X = X.reshape(-1, units.shape[-1])
-    J, r = stage.columns[g].reshape(-1, len(stage.moment)), stage.residuals[g].ravel()
+    J, r = (x.reshape(-1, x.shape[-1]) for x in (stage.columns[g], stage.residuals[g]))
     return _Sums((X.conj().T @ X).real, (X.conj().T @ r).real, (J.conj().T @ X).real)
 
 
 def _line_sums(parts: Sequence[tuple[_Field, np.ndarray]]) -> _Sums:
     """Sums of signals (S, K, m) that act through fields at the same time, line by line."""
-    m, p = parts[0][1].shape[-1], parts[0][0].columns.shape[-1]
-    own, with_residual, with_columns = np.zeros((m, m)), np.zeros(m), np.zeros((p, m))
+    first, m = parts[0][0], parts[0][1].shape[-1]
+    p, R = first.columns.shape[-1], first.residuals.shape[-1]
+    own, with_residuals, with_columns = np.zeros((m, m)), np.zeros((m, R)), np.zeros((p, m))
     for field, X in parts:
         flat, mean = X.reshape(-1, X.shape[-1]), X[:, 0].real
         for other, Y in parts:
@@ -332,10 +400,10 @@ def _line_sums(parts: Sequence[tuple[_Field, np.ndarray]]) -> _Sums:
                 across = np.einsum("skm,sk->sm", X.conj(), along).real.T @ Y[:, 0].real
                 both = np.sum(field.moved.conj() * other.moved, axis=(1, 2)).real
                 own = own + across + across.T + mean.T @ (both[:, None] * Y[:, 0].real)
-        with_residual = with_residual + (flat.conj().T @ field.residual.ravel()).real + mean.T @ field.moved_residual
-        columns = field.columns.reshape(len(flat), -1)
+        residuals, columns = (x.reshape(len(flat), -1) for x in (field.residuals, field.columns))
+        with_residuals = with_residuals + (flat.conj().T @ residuals).real + mean.T @ field.moved_residuals
         with_columns = with_columns + (columns.conj().T @ flat).real + field.moved_columns.T @ mean
-    return _Sums(own, with_residual, with_columns)
+    return _Sums(own, with_residuals, with_columns)
 
 
 def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | None:

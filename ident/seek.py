@@ -229,7 +229,7 @@ def with_inertias(found: Sought, max_causes: int, workers: Workers) -> Sought:
         return replace(found, late=found.late or workers.late)
     other = attribute(problem, baseline, max_causes=max_causes, workers=workers)
     left = left_over(other.final, result.final)
-    if not worth_it(left, foretold(found.setup, result.final, other.final, workers)):
+    if not worth_it(left, foretold(found.setup.problem, result.final, other.final, workers)):
         return replace(found, late=found.late or workers.late)
     return replace(found, setup=replace(found.setup, problem=problem), result=other, rigid=rigid, late=workers.late)
 
@@ -258,14 +258,14 @@ def worth_it(left: float, left_out: tuple[float, float]) -> bool:
     return least <= 1.0 and (left <= SETTLED_BY_INERTIAS or most < 1.0)
 
 
-def foretold(setup: Setup, one: Fit, other: Fit, workers: Workers) -> tuple[float, float]:
+def foretold(problem: Problem, one: Fit, other: Fit, workers: Workers) -> tuple[float, float]:
     """Interval of what ``other``, of inertias found, leaves of parts of the motions over what ``one`` leaves there
     (``ratio_interval``), both fitted again without these parts; (inf, inf) where they cannot be.
 
     Motions that are held out take no part in the choice: they measure what it gains.
     """
     try:
-        errors = errors_on_parts(setup.problem, one, other, workers, renewed=True)
+        errors = errors_on_parts(problem, one, other, workers, renewed=True)
     except NOT_COMPUTED:
         return np.inf, np.inf
     return ratio_interval(errors, np.random.default_rng(SEED), TOWARDS)

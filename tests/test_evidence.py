@@ -394,7 +394,7 @@ def test_signals_summed_line_by_line_are_those_of_whole_torques(identified, chan
     units = sum(_gain(pred, c, 3)[None, :, :, None] * x[:, :, None] for c, x in parts)
     way = moved_by_gears(pred) @ _share_of_gears(pred, channel, 3)
     whole = _whole_sums(stage, 0, units + way[..., None] * X[:, :1, None].real)
-    for name in ("own", "residual", "columns"):
+    for name in ("own", "residuals", "columns"):
         a, b = getattr(quick, name), getattr(whole, name)
         assert np.abs(a - b).max() < 1e-10 * np.abs(b).max()
 

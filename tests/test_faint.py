@@ -26,6 +26,7 @@ from ident.faint import (
     left_by_laws,
     of_timing,
     seen,
+    with_other_scatter,
 )
 from ident.hypotheses import catalogue
 from ident.model import Effect, along_record, as_loop
@@ -35,7 +36,7 @@ from ident.problem import predictions
 from ident.refits import refit
 from ident.refuted import without_denied
 from ident.rounds import Round, temper_of, told_share, weighed_round
-from ident.screening import Score
+from ident.screening import Score, most_explained, screen
 from ident.search import hopeful
 from ident.seek import explained
 from ident.trust import denied
@@ -152,6 +153,25 @@ def test_a_noisier_joint_shows_less(identified, hypotheses):
     costs = baseline.counts.copy()
     costs[first.hypothesis.joint] *= 1.3
     assert seen(loud, replace(baseline, costs=costs)) is None
+
+
+def test_several_draws_are_held_against_all_hypotheses_as_each_of_them_alone(identified, hypotheses):
+    """At the wave numbers that each of them shows too."""
+    _, setup, current = identified
+    rng, preds = np.random.default_rng(3), predictions(setup.problem, current.model, current.remainders)
+    others = [
+        replace(
+            setup.problem,
+            groups=tuple(with_other_scatter(g, p, rng) for g, p in zip(setup.problem.groups, preds, strict=True)),
+        )
+        for _ in range(3)
+    ]
+    for some in ([h for h in hypotheses if not h.repeats], [h for h in hypotheses if h.repeats]):
+        each = [screen(other, current, preds, some)[0].gain for other in others]
+        together = most_explained(setup.problem, current, preds, some, others)
+        assert np.all(together >= (1.0 - 1e-6) * np.array(each))
+        if not some[0].repeats:
+            assert together == pytest.approx(each, rel=1e-6)
 
 
 def test_noise_whose_lines_go_together_shows_nothing(identified, hypotheses):

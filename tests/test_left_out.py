@@ -113,6 +113,7 @@ def test_the_search_in_motions_stops_where_laws_follow_what_was_driven_alone(wan
     assert found.left_share > 0.0 and found.final.chi2_per_dof > 1e3
 
 
+@pytest.mark.slow
 def test_what_follows_no_law_at_one_joint_hides_no_cause_at_another(wandered_arm):
     problem, first = wandered_arm
     some = {"coulomb_friction", "cogging", "gravity_spring"}

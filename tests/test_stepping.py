@@ -80,6 +80,7 @@ def test_what_joints_share_need_not_explain_noise_that_is_known_too_small(left, 
     assert not told_by_most(before, before)
 
 
+@pytest.mark.slow
 def test_a_cause_in_records_of_coarse_steps_is_named_alone(locked, tmp_path):
     hidden = parse_effect("coulomb_friction@elbow_joint:torque=3", locked)
     verdict = diagnose(recorded(locked, tmp_path, [hidden], timestep=1e-3, integrator="IMPLICITFAST"))

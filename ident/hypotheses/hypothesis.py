@@ -222,7 +222,7 @@ class SignalScale:
 
     Attributes:
         v: rms velocity, rad/s; q: rms excursion, rad; delta: quantiles of |deflection| at
-        10, 50, 90, 99.5 %; delta_rms: rad; torque: rms dynamic torque, N m; residual: rms residual torque, N m;
+        10, 50, 90, 99.5 %; delta_rms: rad; torque: rms dynamic torque, N m;
         peak_torque: N m; exceeded_torque: for a fifth of the time in motions, N m, without bounds where they repeat;
         stiffness: N m/rad; wave_numbers: candidate periodicities in motor angle, 1/rad;
         highest_line: that is compared, Hz.
@@ -233,7 +233,6 @@ class SignalScale:
     delta: np.ndarray
     delta_rms: float
     torque: float
-    residual: float
     stiffness: float
     peak_torque: float
     exceeded_torque: float
