@@ -34,6 +34,7 @@ VARIABLES: dict[str, Callable[[Motion, int], np.ndarray]] = {
 LABELS = {
     "v": "motor velocity, rad/s",
     "q": "motor position, rad",
+    "swing": "motor position about its mean in the record, rad",
     "delta": "gear deflection, rad",
     "time": "time, s",
     "torque": "recorded torque, N m",

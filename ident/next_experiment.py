@@ -219,7 +219,8 @@ def advice(causes: Sequence[Cause], unknown: bool, axes: int) -> str | None:
         if cause.probability < 0.9 and cause.alternatives:
             other = cause.alternatives[0]
             what = ADVICE.get(frozenset({cause.effect, other.effect}), f"{postures} and a second level of amplitude")
-            return f"To tell {cause.effect} from {other.effect} at {cause.joint}: {what}."
+            own = "" if cause.joint == other.joint else f" at {cause.joint}"
+            return f"To tell {cause.effect}{own} from {other.effect} at {other.joint}: {what}."
     if unknown:
         return (
             f"Two more levels of amplitude and {postures}, to see how the unknown cause scales with motion and {load}."

@@ -168,6 +168,8 @@ def evidence_plot(
             curves.append(group.to_time(X)[..., 0])
         if h.variable in VARIABLES:
             variable = VARIABLES[h.variable](motion, j)
+        elif h.variable == "swing":
+            variable = motion.q(j) - motion.q(j).mean(axis=1, keepdims=True)
         else:
             variable = motion.time if h.variable == "time" else curves[1]
         # A motion is closed by a return that nobody recorded.

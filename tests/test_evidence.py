@@ -48,7 +48,7 @@ from ident.posture import moved_by_gears
 from ident.problem import Weights, data_counts, predictions
 from ident.pruning import plainly_special, pruned, renamed, without_shadows
 from ident.refits import polish, refit, reweighted, settled, to_compete, turned, under_own_noise
-from ident.reporting import frf_views, most_affected
+from ident.reporting import evidence_plot, frf_views, most_affected
 from ident.rounds import (
     Round,
     attribute_once,
@@ -1815,3 +1815,15 @@ def test_many_other_bodies_and_hinges_stand_for_something_else(named):
 
     assert patchwork(effects(hinge, *bodies))
     assert not patchwork(effects(hinge, bodies[0], *laws)) and not patchwork([])
+
+
+def test_friction_that_yields_is_shown_about_where_each_record_swings(identified, named):
+    """Side by side, its loops in postures apart are lines."""
+    _, setup, result = identified
+    slip = Effect(named["presliding_friction", "elbow_joint"], np.array([3e3, 0.5, 1.0, 0.0]))
+    fit = replace(result, model=replace(result.model, effects=(slip,)))
+    preds = predictions(setup.problem, fit.model, fit.remainders)
+    plot = evidence_plot(setup.problem, fit, preds, slip, 0)
+    swing = max(np.ptp(pred.motion().q(2), axis=1).max() for pred in preds)
+    assert 0.5 * swing < np.ptp(plot.model_x) <= 2.0 * swing and abs(np.mean(plot.model_x)) < 0.05 * swing
+    assert "about its mean" in plot.x_label

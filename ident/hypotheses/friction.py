@@ -386,7 +386,7 @@ def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothes
         screen,
         "The residual torque of {joint} makes loops in position: friction that yields as a spring of"
         " {stiffness:.3g} N m/rad before it slips at {coulomb:.3g} N m.",
-        variable="q",
+        variable="swing",
         options={
             "absorbs": "coulomb_friction",
             "absorb": lambda p, weights, old: np.array([p[0] * old[0] / p[1], old[0], *p[2:]]),
