@@ -171,7 +171,7 @@ def as_load(current: Fit, own: Effect, others: Sequence[Effect]) -> list[Effect]
     h, robot = own.hypothesis, current.model.structure.robot
     if not h.options.get("carries_load") or any(e.hypothesis.effect == "payload" for e in others):
         return []
-    with_change, without = (m.built()[0] for m in (current.model, replace(current.model, effects=tuple(others))))
+    with_change, without = (m.built[0] for m in (current.model, replace(current.model, effects=tuple(others))))
     p = payload_like(robot.payload_link, without, with_change)
     return [] if p is None else [Effect(payload(robot.payload_link), p)]
 

@@ -54,19 +54,6 @@ def stepped(problem: Problem, model: Model, step: np.ndarray) -> Model:
     return unpack(model, pack(model) + step, TIMING_LIMIT * problem.sampling.sample_time)
 
 
-def effect_steps(effect: Effect) -> list[tuple[np.ndarray, float]]:
-    """Parameters of an effect after a step of each of its coordinates, and the step."""
-    steps = []
-    for c, q in enumerate(effect.hypothesis.parameters):
-        x, p, step = q.to_internal(effect.p[c]), effect.p.copy(), q.step
-        p[c] = q.to_external(x + step)
-        if p[c] == effect.p[c]:
-            step = -step
-            p[c] = q.to_external(x + step)
-        steps.append((p, step))
-    return steps
-
-
 def shifts_posture(model: Model) -> bool:
     """Whether effects move the arm to another posture; along the record that says what the gear carries."""
     return any(e.hypothesis.channel in SHIFTS and not is_along_record(e.hypothesis) for e in model.effects)

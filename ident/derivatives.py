@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ident.columns import Columns, Products
-from ident.coordinates import coordinate_names, effect_steps, moves_geometry, moves_links, pack, shifts_posture, unpack
+from ident.coordinates import coordinate_names, moves_geometry, moves_links, pack, shifts_posture, unpack
 from ident.errors_in_variables import impedance_slopes, scatter_information, scatter_slope
 from ident.extended import Prediction, of_channel, predict, predict_at, through_drives
 from ident.group import Group
@@ -191,8 +191,8 @@ def _effect_columns(
     """
     effect = model.effects[i]
     felt = [group.window is not None or not q.at_start for q in effect.hypothesis.parameters]
-    steps = [s for s, f in zip(effect_steps(effect), felt, strict=True) if f]
-    columns = iter(_effect_differences(problem, model, group, pred, remade, effect, steps, exact, posture))
+    steps = [s for s, f in zip(model.stepped[i], felt, strict=True) if f]
+    columns = iter(_effect_differences(problem, model, group, pred, remade, i, steps, exact, posture))
     none = np.zeros((len(pred.U), compared_lines(group), model.structure.n + len(group.links)), complex)
     return [next(columns) if f else none for f in felt]
 
@@ -203,29 +203,29 @@ def _effect_differences(
     group: Group,
     pred: Prediction,
     remade: Prediction,
-    effect: Effect,
-    steps: Sequence[tuple[np.ndarray, float]],
+    i: int,
+    steps: Sequence[tuple[Model, float]],
     exact: bool,
     posture: np.ndarray | None,
 ) -> list[np.ndarray]:
-    """Change (S, K, n + M) of the predicted outputs by each of some ``steps`` of an effect, over its size; else as
+    """Change (S, K, n + M) of the predicted outputs by each of some ``steps`` of effect ``i``, over its size; else as
     ``_effect_columns``."""
-    h, top = effect.hypothesis, compared_lines(group)
+    effect, top = model.effects[i], compared_lines(group)
+    h, moves = effect.hypothesis, [(there.effects[i].p, step) for there, step in steps]
     if h.channel == "motor" and not joints_along_record(model, group):
-        return [column[:, :top] for column in _motor_columns(model, group, pred, effect, steps)]
+        return [column[:, :top] for column in _motor_columns(model, group, pred, effect, moves)]
     if h.channel == "drive":
-        return [column[:, :top] for column in _drive_columns(model, group, pred, effect, steps)]
-    models = [
-        Model(model.structure, model.par, tuple(Effect(h, p) if e is effect else e for e in model.effects))
-        for p, _ in steps
-    ]
+        return [column[:, :top] for column in _drive_columns(model, group, pred, effect, moves)]
     if exact or moves_geometry(effect, group.window is not None):
         base, posture = remade, None
-        moved = [_again(problem, m, group, pred, 1) for m in models]
+        moved = [_again(problem, there, group, pred, 1) for there, _ in steps]
     else:
         base = pred
         held: dict[str, Any] = {"W": pred.solution.W, "torques": pred.solution.torques}
-        moved = [predict_at(m, pred.structure, pred.par, pred.plane, group, problem.sampling, **held) for m in models]
+        moved = [
+            predict_at(there, pred.structure, pred.par, pred.plane, group, problem.sampling, **held)
+            for there, _ in steps
+        ]
     return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]
 
 
@@ -298,7 +298,7 @@ def shared_slope(problem: Problem, model: Model, preds: Sequence[Prediction], we
             yield m, pred.plane.s[:K, None, None] * pred.sampled_impedance[:K]
         at = m + 1
         for i, effect in enumerate(model.effects):
-            slopes = impedance_slopes(model, group, pred, problem.sampling, i, effect_steps(effect))
+            slopes = impedance_slopes(model, group, pred, problem.sampling, i)
             yield from ((at + c, slope) for c, slope in enumerate(slopes))
             at += len(effect.p)
 

@@ -9,7 +9,7 @@ what is left has its minimum where the model is right, whatever the weights.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from ident.columns import Products
 from ident.extended import Prediction, moves_plane, predict_at
 from ident.group import Group
 from ident.inverse import Sampling, make_plane
-from ident.model import Effect, Model, is_linear
+from ident.model import Model, is_linear
 from ident.stiction import as_held
 
 MOST = 0.9  # of the information on any direction of the coordinates, that may be taken off as noise
@@ -148,24 +148,18 @@ def impedance_slopes(
     pred: Prediction,
     sampling: Sampling,
     effect: int,
-    steps: Sequence[tuple[np.ndarray, float]],
 ) -> Iterator[np.ndarray]:
-    """Derivatives (K, n, n) of the impedance by the coordinates of an effect that is linear; none of one that is not.
-
-    Args:
-        effect: its number in the model; steps: parameters after a step of each coordinate, and the step.
-    """
+    """Derivatives (K, n, n) of the impedance by the coordinates of an effect, of that number, that is linear; none of
+    one that is not."""
     h, K = model.effects[effect].hypothesis, group.n_compared
     if not (is_linear(h) or moves_plane(h)):
         return
     held: dict[str, Any] = {"W": pred.solution.W, "torques": pred.solution.torques}
     elsewhere = pred.about is not pred.plane and (h.channel == "model" or moves_plane(h))
-    for p, step in steps:
-        effects = tuple(Effect(h, p) if i == effect else e for i, e in enumerate(model.effects))
-        there = Model(model.structure, model.par, effects)
+    for there, step in model.stepped[effect]:
         structure, par, plane = pred.structure, pred.par, pred.plane
         if h.channel == "model":
-            structure, par = there.built()
+            structure, par = there.built
             plane = make_plane(structure, par, group, sampling)
         if elsewhere:
             moved = predict_at(there, structure, par, plane, group, sampling, **held)

@@ -133,7 +133,7 @@ def predict(
         steps: fixed-point steps on it; ``REMAINDER_STEPS`` cold and 0 warm where None.
         torques: of laws of the gear and the links, to start from (of a model near by with the same chain).
     """
-    structure, par = model.built()
+    structure, par = model.built
     plane = make_plane(structure, par, group, sampling)
     return predict_at(model, structure, par, plane, group, sampling, W=W, steps=steps, torques=torques)
 

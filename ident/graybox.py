@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from ident.chain import Structure
+from ident.compliance import link_compliance
 from ident.time_steps import TimeSteps, differences
 from robot_assets.robot import Robot
 
@@ -234,12 +235,8 @@ def impedance(
     K = stiffness_diagonal(structure, par)
     D = damping_diagonal(structure, par)
     rate, square = differences(s, steps)
-    A = square[:, None, None] * lin.M + lin.Kg
-    diag = np.arange(structure.n_coordinates)
-    A[:, diag, diag] += K + rate[:, None] * D
-    if steps is not None:
-        A[:, diag, diag] += steps.apart * square[:, None] * D
-    A_inv = np.linalg.inv(A)
+    damped = rate if steps is None else rate + steps.apart * square
+    A_inv = link_compliance(lin.M, lin.Kg, K, D, damped, square)
     C = par.stiffness + rate[:, None] * par.damping
     Z = -C[:, :, None] * A_inv[:, driven[:, None], driven] * C[:, None, :]
     k = np.arange(n)

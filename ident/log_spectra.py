@@ -165,7 +165,7 @@ def spectra_of(group: Group) -> Spectra:
 
 def mean_cost(problem: Problem, spectra: Sequence[Spectra], model: Model) -> float:
     """Mean of the bounded squares of logarithms over what is looked at, of a model that is linear but for its chain."""
-    structure, par = model.built()
+    structure, par = model.built
     total, count = 0.0, 0
     try:
         for x in spectra:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,18 @@ class Effect:
         """A parameter by its name, SI."""
         return float(self.p[[q.name for q in self.hypothesis.parameters].index(name)])
 
+    def stepped(self) -> list[tuple[np.ndarray, float]]:
+        """Parameters after a step of each coordinate, and the step."""
+        steps = []
+        for c, q in enumerate(self.hypothesis.parameters):
+            x, p, step = q.to_internal(self.p[c]), self.p.copy(), q.step
+            p[c] = q.to_external(x + step)
+            if p[c] == self.p[c]:
+                step = -step
+                p[c] = q.to_external(x + step)
+            steps.append((p, step))
+        return steps
+
 
 @dataclass(frozen=True)
 class Model:
@@ -33,6 +47,22 @@ class Model:
     par: Parameters
     effects: tuple[Effect, ...] = ()
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # what is made of them is made again elsewhere
+
+    @cached_property
+    def stepped(self) -> tuple[tuple[tuple[Model, float], ...], ...]:
+        """For each effect, the models after a step of each of its coordinates, and the steps."""
+
+        def with_effect(i: int, p: np.ndarray) -> Model:
+            effects = tuple(replace(e, p=p) if k == i else e for k, e in enumerate(self.effects))
+            return replace(self, effects=effects)
+
+        return tuple(
+            tuple((with_effect(i, p), step) for p, step in effect.stepped()) for i, effect in enumerate(self.effects)
+        )
+
+    @cached_property
     def built(self) -> tuple[Structure, Parameters]:
         """Chain and parameters with the effects that change them."""
         change = Change()

@@ -21,7 +21,7 @@ def test_links_on_lightly_damped_gears_are_solved_along_large_motions(clean, sha
     problem = set_up(clean[0]).problem
     group = next(g for g in problem.groups if g.window is None)
     light = replace(problem.nominal, damping=share * problem.nominal.damping)
-    structure, par = Model(problem.structure, light).built()
+    structure, par = Model(problem.structure, light).built
     plane = make_plane(structure, par, group, problem.sampling)
     large = true_position(group, par, problem.sampling).copy()
     large[:, 1:] *= larger
