@@ -10,17 +10,19 @@ finds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from ident.graybox import Parameters, equilibrium, impedance, linearise
+from ident.graybox import Linearisation, Parameters, equilibrium, impedance, linearise
 from ident.group import Group
 from ident.inverse import torque_record
 from ident.model import Effect, Model
 from ident.problem import NOT_COMPUTED, Problem
 from ident.thinning import thinned
+from ident.time_steps import differences
 from robot_assets.robot import guessed_drives
 
 MOST_LINES = 40  # looked at of a group
@@ -114,19 +116,53 @@ def valley(problem: Problem, spectra: Sequence[Spectra], model: Model) -> tuple[
     """
     axes = axes_of(problem, model)
     x = np.array([axis.start for axis in axes])
-    best, cost = model, mean_cost(problem, spectra, model)
+    cost_at = costs_near(problem, spectra, model)
+    cost = mean_cost(problem, spectra, model)
     for step in np.log(STEPS):
         whole = step == np.log(STEPS[0])
         for _ in range(SWEEPS):
             before = cost
             for k, axis in reversed(list(enumerate(axes))):
                 for value in axis.values(x[k], step, whole) if axis.early or not whole else ():
-                    other = _made(model, problem.nominal, np.where(np.arange(len(x)) == k, value, x))
-                    if (found := mean_cost(problem, spectra, other)) < cost:
-                        cost, best, x[k] = found, other, value
+                    other = np.where(np.arange(len(x)) == k, value, x)
+                    if (found := cost_at(other)) < cost:
+                        cost, x = found, other
             if cost > (1.0 - BETTER) * before:
                 break
-    return best, cost
+    return _made(model, problem.nominal, x), cost
+
+
+def costs_near(problem: Problem, spectra: Sequence[Spectra], model: Model) -> Callable[[np.ndarray], float]:
+    """``mean_cost`` of the models ``_made`` at offsets.
+
+    Where offsets differ from those before by motors alone the links are still the same, and by dampers alone the
+    posture.
+    """
+    n, records = problem.structure.n, _records(problem, spectra, model)
+    _, inertia, damping, viscous = (slice(i * n, (i + 1) * n) for i in range(len(FIELDS)))
+
+    def without(x: np.ndarray, *parts: slice) -> tuple[float, ...]:
+        left = np.array(x)
+        for part in parts:
+            left[part] = 0.0
+        return tuple(left)
+
+    @lru_cache(maxsize=1)
+    def postures(x: tuple[float, ...]) -> list[Linearisation]:
+        return _postures(spectra, _made(model, problem.nominal, np.array(x)))
+
+    @lru_cache(maxsize=1)
+    def links(x: tuple[float, ...]) -> list[np.ndarray]:
+        return _links(spectra, _made(model, problem.nominal, np.array(x)), postures(without(np.array(x), damping)))
+
+    def cost(x: np.ndarray) -> float:
+        try:
+            Z = links(without(x, inertia, viscous))
+        except NOT_COMPUTED:
+            return np.inf
+        return _cost(spectra, records, Z, _made(model, problem.nominal, x).par)
+
+    return cost
 
 
 def _made(model: Model, nominal: Parameters, x: np.ndarray) -> Model:
@@ -165,17 +201,45 @@ def spectra_of(group: Group) -> Spectra:
 
 def mean_cost(problem: Problem, spectra: Sequence[Spectra], model: Model) -> float:
     """Mean of the bounded squares of logarithms over what is looked at, of a model that is linear but for its chain."""
-    structure, par = model.built
-    total, count = 0.0, 0
     try:
-        for x in spectra:
-            lin = linearise(structure, equilibrium(structure, par, x.group.posture))
-            record = torque_record(par, x.group, problem.sampling)
-            Z = record[:, None, None] * impedance(structure, par, lin, 1j * x.group.omega, x.group.steps)[0]
-            torque = np.matmul(Z, x.position[..., None])[..., 0]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                square = np.abs(np.log(torque / x.torque)[x.seen]) ** 2
-            total, count = total + float(np.sum(square / (1.0 + square))), count + len(square)
+        Z = _links(spectra, model, _postures(spectra, model))
     except NOT_COMPUTED:
         return np.inf
+    return _cost(spectra, _records(problem, spectra, model), Z, model.par)
+
+
+def _records(problem: Problem, spectra: Sequence[Spectra], model: Model) -> list[np.ndarray]:
+    """Recorded torque per continuous torque (K,) of each group."""
+    return [torque_record(model.par, x.group, problem.sampling) for x in spectra]
+
+
+def _postures(spectra: Sequence[Spectra], model: Model) -> list[Linearisation]:
+    """Of each group, the arm at its equilibrium."""
+    structure, par = model.built
+    return [linearise(structure, equilibrium(structure, par, x.group.posture)) for x in spectra]
+
+
+def _links(spectra: Sequence[Spectra], model: Model, postures: Sequence[Linearisation]) -> list[np.ndarray]:
+    """Of each group, the impedance (K, n, n) behind motors without inertia and friction."""
+    structure, par = model.built
+    bare = replace(par, inertia=np.zeros_like(par.inertia), viscous=np.zeros_like(par.viscous))
+    return [
+        impedance(structure, bare, lin, 1j * x.group.omega, x.group.steps)[0]
+        for x, lin in zip(spectra, postures, strict=True)
+    ]
+
+
+def _cost(
+    spectra: Sequence[Spectra], records: Sequence[np.ndarray], links: Sequence[np.ndarray], par: Parameters
+) -> float:
+    """``mean_cost`` with what ``_links`` says, and the motors of ``par``."""
+    total, count = 0.0, 0
+    for x, record, Z in zip(spectra, records, links, strict=True):
+        rate, square = (d[:, None] for d in differences(1j * x.group.omega, x.group.steps))
+        beside = 0.0 if x.group.steps is None else x.group.steps.apart
+        motors = square * (par.inertia + beside * par.viscous) + rate * par.viscous
+        torque = record[:, None] * (np.matmul(Z, x.position[..., None])[..., 0] + motors * x.position)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = np.abs(np.log(torque / x.torque)[x.seen]) ** 2
+        total, count = total + float(np.sum(left / (1.0 + left))), count + len(left)
     return total / count

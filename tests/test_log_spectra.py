@@ -6,7 +6,20 @@ import numpy as np
 import pytest
 
 from ident.baseline import fit_baseline, implausible
-from ident.log_spectra import GUESSED, KNOWN, begun_by_logarithms, spectra_of
+from ident.graybox import equilibrium, impedance, linearise
+from ident.inverse import torque_record
+from ident.log_spectra import (
+    FIELDS,
+    GUESSED,
+    KNOWN,
+    begun_by_logarithms,
+    costs_near,
+    looked_at,
+    mean_cost,
+    spectra_of,
+)
+from ident.model import Model
+from ident.time_steps import TimeSteps
 from ident.torque_fit import anneal
 
 
@@ -64,6 +77,36 @@ def test_lines_that_are_noise_or_not_excited_are_not_looked_at(identified):
     )
     assert np.mean(seen.seen) > 0.5
     assert not np.any(spectra_of(replace(group, white_torque_noise=np.full(6, 1e9))).seen)
+
+
+def whole_cost(problem, spectra, model):
+    """Mean of the bounded squares of logarithms, of the whole impedance."""
+    squares = []
+    for x in spectra:
+        lin = linearise(model.structure, equilibrium(model.structure, model.par, x.group.posture))
+        Z = impedance(model.structure, model.par, lin, 1j * x.group.omega, x.group.steps)[0]
+        torque = np.einsum("kij,skj->ski", Z, x.position)
+        torque = torque_record(model.par, x.group, problem.sampling)[:, None] * torque
+        squares.append(np.abs(np.log(torque / x.torque)[x.seen]) ** 2)
+    every = np.concatenate(squares)
+    return np.mean(every / (1.0 + every))
+
+
+@pytest.mark.parametrize("steps", [None, TimeSteps(1e-3, "implicit"), TimeSteps(1e-3, "apart")])
+def test_costs_near_a_model_are_those_of_each_model_there(identified, steps):
+    """Whatever was asked before: what is kept of that is only what is still the same."""
+    problem = identified[1].problem
+    problem = replace(problem, groups=tuple(replace(g, steps=steps) for g in problem.groups))
+    n, nominal, spectra = problem.structure.n, problem.nominal, looked_at(problem)
+    cost_at = costs_near(problem, spectra, Model(problem.structure, nominal))
+    rng, x = np.random.default_rng(0), np.zeros(4 * n)
+    for k in rng.permutation(np.repeat(np.arange(4 * n), 2)):
+        x[k] = rng.normal()
+        drives = {f: getattr(nominal, f) * np.exp(x[i * n : (i + 1) * n]) for i, f in enumerate(FIELDS)}
+        model = Model(problem.structure, replace(nominal, **drives))
+        expected = whole_cost(problem, spectra, model)
+        assert cost_at(x) == pytest.approx(expected, rel=1e-9)
+        assert mean_cost(problem, spectra, model) == pytest.approx(expected, rel=1e-9)
 
 
 def test_motions_tell_no_logarithms(identified):
