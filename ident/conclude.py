@@ -51,6 +51,7 @@ from ident.trust import (
     left_of,
     left_on_held_out,
     patchwork,
+    piece_of_a_curve,
     shadowed,
     shown,
     too_fast,
@@ -212,6 +213,7 @@ def trust_in(effect: Effect, of_effect: Round, found: Findings, doubted: bool, c
     doubtful = (
         pointless(effect, found.final.model.par.stiffness[h.joint])
         or too_fast(problem, found.last, effect)
+        or piece_of_a_curve(effect, found.final, found.last)
         or within_steps(effect, found.setup.steps)
         or shadowed(of_effect, found.result.rounds)
         or h.key in found.belied

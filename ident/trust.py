@@ -42,6 +42,7 @@ HALF_TRUSTED = 0.1
 # of the fall of the cost that a faint cause foretells on held-out data, below which it does not come
 DENIED_SHARE = 0.25
 CHANCE = 3.0  # standard deviations of that fall, within which it may be short by chance
+SPRINGS = "gravity_spring", "dress_pack"  # of which the torque follows the position of the link
 PATCHES = 3  # bodies and hinges other than those described, from which no name is trusted
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
 
@@ -199,6 +200,23 @@ def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect
         slow = wave_number * speed < group.omega[group.n_compared - 1]
         path += float(np.sum(speed[slow])) * group.period_time / speed.shape[1]
     return wave_number * path < FEWEST_PERIODS * 2.0 * np.pi
+
+
+def piece_of_a_curve(effect: Effect, final: Fit, predictions: Sequence[Prediction]) -> bool:
+    """Whether an effect is a spring to the link or a ripple beside one, of which the ripple does not come round along
+    all that its joint moves, and both leave more than noise there.
+
+    A line and a part of a wave draw nearly any torque over the position, and where they miss it is none of theirs.
+    """
+    j = effect.hypothesis.joint
+    if effect.hypothesis.on_chain or final.costs[j] <= LEFT_ERROR * final.counts[j]:
+        return False
+    at_joint = [e for e in final.model.effects if e.hypothesis.joint == j and not e.hypothesis.on_chain]
+    springs = [e for e in at_joint if e.hypothesis.effect in SPRINGS]
+    ends = [(q.min(), q.max()) for q in (pred.motion().q(j) for pred in predictions)]
+    path = max(top for _, top in ends) - min(bottom for bottom, _ in ends)
+    parts = [e for e in at_joint if e.hypothesis.repeats and e.value(RIPPLE) * path < 2.0 * np.pi]
+    return bool(springs and parts) and any(e is effect for e in (*springs, *parts))
 
 
 def within_steps(effect: Effect, steps: Sequence[Steps]) -> bool:

@@ -36,7 +36,7 @@ from ident.hypotheses import catalogue
 from ident.hypotheses.bodies import LOAD_NATS, link_inertia, payload, payload_like
 from ident.hypotheses.drive import torque_saturation
 from ident.hypotheses.hinges import hinge_inertia
-from ident.hypotheses.hypothesis import LOG_SPREAD, Parameter
+from ident.hypotheses.hypothesis import LOG_SPREAD, RIPPLE, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import apply_change
 from ident.identification import identify
@@ -77,7 +77,7 @@ from ident.search import (
 from ident.seek import left_over
 from ident.strong import OTHER_MOTION, beside_strong, loudest_joint, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
-from ident.trust import fails_held_out, left_on_held_out, patchwork, shadowed, shown
+from ident.trust import fails_held_out, left_on_held_out, patchwork, piece_of_a_curve, shadowed, shown
 from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, JointGain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
@@ -1827,3 +1827,30 @@ def test_friction_that_yields_is_shown_about_where_each_record_swings(identified
     swing = max(np.ptp(pred.motion().q(2), axis=1).max() for pred in preds)
     assert 0.5 * swing < np.ptp(plot.model_x) <= 2.0 * swing and abs(np.mean(plot.model_x)) < 0.05 * swing
     assert "about its mean" in plot.x_label
+
+
+@pytest.mark.parametrize(("periods", "second", "left", "curve"), [
+    (0.7, "gravity_spring", 30.0, True),
+    (0.7, "gravity_spring", 1.5, False),
+    (1.5, "gravity_spring", 30.0, False),
+    (0.7, "coulomb_friction", 30.0, False),
+])  # fmt: skip
+def test_a_spring_and_a_part_of_a_wave_that_leave_more_than_noise_draw_a_curve(
+    identified, named, periods, second, left, curve
+):
+    _, setup, result = identified
+    preds = predictions(setup.problem, result.model, result.remainders)
+    travel = np.ptp(np.concatenate([pred.motion().q(2).ravel() for pred in preds]))
+    waves, other = named["cogging", "elbow_joint"], named[second, "elbow_joint"]
+    wave = {RIPPLE: periods * 2.0 * np.pi / travel}
+    effects = (
+        Effect(waves, np.array([wave.get(q.name, 1.0) for q in waves.parameters])),
+        Effect(other, np.ones(len(other.parameters))),
+        Effect(named["cogging", "wrist_1_joint"], np.ones(len(waves.parameters))),
+    )
+    final = replace(
+        result,
+        model=replace(result.model, effects=effects),
+        costs=result.counts * np.where(np.arange(6) == 2, left, 1.0),
+    )
+    assert [piece_of_a_curve(e, final, preds) for e in effects] == [curve, curve, False]
