@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from ident.chain import Structure
 from ident.graybox import Parameters, damping_diagonal, rotor_inertia, stiffness_diagonal
 from ident.group import Group, signal_share
 from ident.hypotheses import kernels
-from ident.hypotheses.loop import modal_state, steady_loop
+from ident.hypotheses.loop import Steady, modal_state, steady_loop
 from ident.inverse import Plane
 from ident.model import Effect, has_loop, is_along_record, is_dry
 from ident.motion import Motion, Solution, Torques
@@ -37,6 +37,7 @@ def inner_torques(
     motors: Sequence[Effect],
     given: np.ndarray | None,
     along: frozenset[int],
+    steady: MutableMapping[int, Steady],
 ) -> Torques:
     """Spring and link torques of effects, solved together with the arm they act on.
 
@@ -46,6 +47,7 @@ def inner_torques(
     Args:
         effects: in the gears and on the links; motors: at the motors; given: what the motors deliver, of ``delivered``;
             along: joints that are predicted along the record.
+        steady: loops of the pass before by their number, with which they begin; those of this one take their place.
     """
     S, L, n = solution.Q.shape
     motor = np.zeros((S, L, n), complex)
@@ -66,7 +68,8 @@ def inner_torques(
     at_motors = motor_torques(par, motion, motors) if motors else 0.0
     old_gear = solution.torques.spring + np.zeros((S, L, n), complex)
     old_link = solution.torques.link + np.zeros((S, L, structure.n_coordinates), complex)
-    for effect in loops:
+    alone = len(effects) == 1
+    for number, effect in enumerate(loops):
         j, c = effect.hypothesis.joint, structure.driven[effect.hypothesis.joint]
         compliance = plane.A_inv[:, c, c]
         grid, modes = _modes(structure, par, plane, group, c)
@@ -75,12 +78,12 @@ def inner_torques(
             guess = old_link[..., c] - others
             noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=False))
             free = solution.Q_driven[..., j] + compliance * guess
-            at_link[j] = others + _loop(
-                effect.hypothesis.options["loop"](effect.p), grid, free, noise, compliance, modes, guess
-            )
+            law = effect.hypothesis.options["loop"](effect.p)
+            torque, steady[number] = _loop(law, grid, free, noise, compliance, modes, guess, steady.get(number), alone)
+            at_link[j] = others + torque
         else:
             others = at_gear.get(j, 0.0)
-            law: kernels.Law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
+            law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
             if j in along and is_along_record(effect.hypothesis):
                 said, left = _along_record(law, par, plane, group, motion, j, c, others, motor + at_motors)
                 at_gear[j] = others + said
@@ -89,7 +92,10 @@ def inner_torques(
                 guess = old_gear[..., j] - others
                 noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=True))
                 free = solution.delta[..., j] + compliance * guess
-                at_gear[j] = others + _loop(law, grid, free, noise, compliance, modes, guess)
+                torque, steady[number] = _loop(
+                    law, grid, free, noise, compliance, modes, guess, steady.get(number), alone
+                )
+                at_gear[j] = others + torque
     for j, value in at_gear.items():
         old_gear[..., j] = value
     for j, value in at_link.items():
@@ -212,25 +218,28 @@ def _loop(
     compliance: np.ndarray,
     modes: np.ndarray,
     guess: np.ndarray,
-) -> np.ndarray:
-    """Spectrum (S, L) of the torque of a law in steady state with the arm.
+    near: Steady | None,
+    alone: bool,
+) -> tuple[np.ndarray, Steady]:
+    """Spectrum (S, L) of the torque of a law in steady state with the arm, and that state.
 
     A law turns noise of a motion into a bias, and passes that of each line on to all others. It is shown the lines that
     are signal; the others it answers with its mean slope.
 
     Args:
         free: (S, L) where the arm would be without; noise: (L,) variance of its lines; compliance: (L,) of the arm
-            there; guess: (S, L) torque to begin with.
+            there; guess: (S, L) torque to begin with, where no steady state ``near`` is known;
+            alone: whether no other law is solved with it.
     """
     share = signal_share(free, noise)
     shown = share * free
     x = grid.to_time(shown[..., None])[..., 0]
     rate = grid.to_time((1j * grid.omega * shown)[..., None])[..., 0] if kernels.sees_rate(law) else x
     step = grid.period_time / grid.n_time
-    start = modal_state(guess, grid.omega, step, modes)
-    made = steady_loop(law, x, rate, modes, start, returns=grid.recorded_share, step=step)
-    torque = grid.to_lines(made[..., None])[..., 0]
+    start = modal_state(guess, grid.omega, step, modes) if near is None else None
+    made = steady_loop(law, x, rate, modes, start, near=near, alone=alone, returns=grid.recorded_share, step=step)
+    torque = grid.to_lines(made.torque[..., None])[..., 0]
     slope = kernels.mean_slope(law, grid.to_time((shown - compliance * torque)[..., None])[..., 0])[:, None]
     # The mean is shown as it is, and a gear within its dead band has no stiffness there to answer with.
     torque[:, 1:] += slope / (1.0 + slope * compliance[1:]) * (free - shown)[:, 1:]
-    return torque
+    return torque, made

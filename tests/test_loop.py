@@ -49,7 +49,7 @@ def free_motion(records=3, lines=25, size=2e-3, seed=0):
 
 
 def loop(law, X, guess=None):
-    return steady_loop(law, in_time(X), in_time(1j * OMEGA * X), MODES, guess, step=PERIOD / POINTS)
+    return steady_loop(law, in_time(X), in_time(1j * OMEGA * X), MODES, guess, step=PERIOD / POINTS).torque
 
 
 def rate_of(law, X):
@@ -127,6 +127,24 @@ def test_where_a_loop_begins_does_not_matter(name):
     assert loop(LAWS[name], X, near) == pytest.approx(cold, abs=2e-4 * np.abs(cold).max())
 
 
+@pytest.mark.parametrize("name", LAWS)
+def test_a_loop_goes_on_from_a_steady_state_near_by(name, monkeypatch):
+    """Where nothing has changed a single period says so; where the motion has, it ends where it does from rest."""
+    law, X = LAWS[name], free_motion()
+    periods = []
+    monkeypatch.setattr("ident.hypotheses.loop.loop_sweep", lambda *a: periods.append(1) or kernels.loop_sweep(*a))
+    first, other = ((in_time(size * X), in_time(1j * OMEGA * size * X), MODES) for size in (1.0, 1.001))
+    step = PERIOD / POINTS
+    steady = steady_loop(law, *first, step=step)
+    from_rest = len(periods)
+    again = steady_loop(law, *first, near=steady, step=step)
+    assert len(periods) == from_rest + 1
+    assert again.torque == pytest.approx(steady.torque, abs=2e-7 * np.abs(steady.torque).max())
+    moved, expected = (steady_loop(law, *other, near=near, step=step).torque for near in (steady, None))
+    assert moved == pytest.approx(expected, abs=2e-4 * np.abs(expected).max())
+    assert np.abs(expected - steady.torque).max() > 5e-4 * np.abs(expected).max()
+
+
 def test_an_element_that_hardly_yields_is_followed_to_where_it_creeps(monkeypatch):
     """The mean of its torque moves a little in each period, for hundreds of them where it is only run on."""
     X = free_motion(6)
@@ -143,7 +161,7 @@ def test_what_yields_begins_a_motion_where_it_is_told_to(name, start):
     the law does."""
     law = LAWS[name]._replace(start=start)
     X, recorded = free_motion(lines=6), 0.8
-    h = steady_loop(law, in_time(X), in_time(1j * OMEGA * X), MODES, returns=recorded)
+    h = steady_loop(law, in_time(X), in_time(1j * OMEGA * X), MODES, returns=recorded).torque
     x = in_time(X - compliance() * spectrum(h))
     _, a, b, k, exponent, recoil = law.shape
     spring, stiffness = (a, k) if law.code == kernels.CABLE else (0.0, a)

@@ -23,7 +23,7 @@ def test_records_that_settle_at_different_times_call_for_no_more_code():
     gain = 1e-3 * (decay - 1.0) / pole
     modes = np.array([[pole], [decay], [0.5 * gain], [0.5 * gain]])
     for law in (Law(BACKLASH, 1e-3, 0.0, 1e3), Law(HYSTERESIS, 1e3, 0.5, 1e3)):
-        torque = steady_loop(law, linear, np.zeros_like(linear), modes)
+        torque = steady_loop(law, linear, np.zeros_like(linear), modes).torque
         assert torque.shape == linear.shape and np.any(torque[2])
         along_motion(law, linear, np.zeros_like(linear))
     assert [len(f.signatures) for f in COMPILED] == before

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ident.hypotheses.kernels import CABLE, HYSTERESIS, LINK, Law, along_motion, loop_sweep
@@ -10,6 +12,21 @@ from ident.mixing import MEMORY, mixed
 SWEEPS = 25  # periods at most until the steady state
 # change of the torque from one to the next, over the largest, that ends them: derivatives are differences
 STEADY = 1e-7
+STEADY_BESIDE_OTHERS = 1e-6  # the same of one that is solved again until it agrees with others
+
+
+@dataclass(frozen=True)
+class Steady:
+    """A law in steady state with the arm.
+
+    Attributes:
+        torque: (S, T) N m.
+        start: (modes, S) complex state one step before the period; memory: (3, S) what the law remembers there.
+    """
+
+    torque: np.ndarray
+    start: np.ndarray
+    memory: np.ndarray
 
 
 def steady_loop(
@@ -19,10 +36,12 @@ def steady_loop(
     modes: np.ndarray,
     guess: np.ndarray | None = None,
     *,
+    near: Steady | None = None,
+    alone: bool = True,
     returns: float = 1.0,
     step: float = 1.0,
-) -> np.ndarray:
-    """Torque (S, T) of a law in steady state with the arm, N m.
+) -> Steady:
+    """A law in steady state with the arm.
 
     ``x = linear - r * h(x, x')`` with ``r`` the compliance of the arm at the law, as a sum of modes stepped
     with a first-order hold: ``x+ = decay x + gain_old h + gain_new h+``. The velocity is that of the modes
@@ -34,12 +53,15 @@ def steady_loop(
         linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for laws that see it alone.
         modes: (4, modes) complex, of ``kernels.modal_compliance``.
         guess: (modes, S) complex state from which to begin; rest where None.
+        near: steady state of the same law in nearly the same motion, from which to begin instead.
+        alone: whether no other law is solved until it agrees with this one.
         returns: share of the period from which on it is but a return that closes a motion, in which what yields comes
             to the ``start`` of the law; 1 where there is none.
         step: s, of time, for laws that lead.
     """
-    code, a, b, k = law[:4]
+    code, _, b, k = law[:4]
     S, T = linear.shape
+    enough = STEADY if alone else STEADY_BESIDE_OTHERS
     remembers = code in (HYSTERESIS, CABLE)
     shape = (*law.shape[:5], law.lead / step) if code == LINK else law.shape
     last = round(returns * T) if remembers else T
@@ -48,24 +70,20 @@ def steady_loop(
     whole = (decay**T)[:, None]
     linear, rate = np.ascontiguousarray(linear.T), np.ascontiguousarray(rate.T)
     start = np.zeros((len(decay), S), complex) if guess is None else guess
-    x = linear[-1] - start.real.sum(axis=0)
-    older = x
-    if code == LINK:
-        older = rate[-1] - (poles @ start).real
-        h = a * x + b * np.tanh(older / k)
-    elif code == CABLE:
-        h = a * x
+    if near is not None:
+        start, memory, part = near.start.copy(), near.memory.copy(), near.torque.T.copy()
     else:
-        h = along_motion(law, x[:, None], np.zeros((S, 1)))[:, 0]
-    memory, left = np.stack([x, older, h]), np.arange(S)
-    out, part = np.zeros((T, S)), np.zeros((T, S))
+        memory, part = _at_first(law, linear, rate, poles, start), np.zeros((T, S))
+    left = np.arange(S)
+    out, begun, remembered = np.zeros((T, S)), start.copy(), memory.copy()
     past: list[tuple[np.ndarray, np.ndarray]] = []
     for sweep in range(SWEEPS):
         before = memory.copy()
+        begun[:, left], remembered[:, left] = start, before
         end, change = loop_sweep(*shape, linear, rate, modes, start, memory, part, last, b * law.start)
         # The state that the torque of this period repeats.
         move = (end - whole * start) / (1.0 - whole) - start
-        moving = change > STEADY if sweep else np.ones(len(left), bool)
+        moving = change > enough if sweep or near is not None else np.ones(len(left), bool)
         if remembers:
             start, move = np.vstack([start, before / unit]), np.vstack([move, (memory - before) / unit])
         past = [*past[-MEMORY:], (start.T, move.T)]
@@ -84,7 +102,18 @@ def steady_loop(
                 memory[2] = np.clip(memory[2], -b, b)
             start = start[: len(decay)].copy()
     out[:, left] = part
-    return out.T.copy()
+    return Steady(out.T.copy(), begun, remembered)
+
+
+def _at_first(law: Law, linear: np.ndarray, rate: np.ndarray, poles: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """What a law remembers (3, S) at the end of periods (T, S), of modes in the state ``start``: deflection, the one
+    before, or the velocity of a ``LINK``, and torque."""
+    code, a, b, k = law[:4]
+    x = linear[-1] - start.real.sum(axis=0)
+    if code == LINK:
+        v = rate[-1] - (poles @ start).real
+        return np.stack([x, v, a * x + b * np.tanh(v / k)])
+    return np.stack([x, x, a * x if code == CABLE else along_motion(law, x[:, None], np.zeros((len(x), 1)))[:, 0]])
 
 
 def modal_state(torque: np.ndarray, omega: np.ndarray, step: float, modes: np.ndarray) -> np.ndarray:
