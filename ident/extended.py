@@ -179,18 +179,7 @@ def predict_at(
     drives = by_channel.get("drive", [])
     given = delivered(drives, group, plane) if any(is_dry(e) for e in motor) else None
     react = (
-        partial(
-            inner_torques,
-            structure,
-            par,
-            plane,
-            group,
-            effects=inner,
-            motors=motor,
-            given=given,
-            along=along,
-            steady={},
-        )
+        partial(inner_torques, structure, par, plane, group, effects=inner, motors=motor, given=given, along=along)
         if inner
         else None
     )

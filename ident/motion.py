@@ -13,12 +13,31 @@ from ident.time_steps import differences
 
 
 @dataclass(frozen=True)
+class Steady:
+    """A law in steady state with the arm.
+
+    Attributes:
+        torque: (S, T) N m.
+        start: (modes, S) complex state of the arm one step before the period; memory: (3, S) what the law remembers
+            there.
+    """
+
+    torque: np.ndarray
+    start: np.ndarray
+    memory: np.ndarray
+
+
+@dataclass(frozen=True)
 class Torques:
-    """What effects add to the linear arm, as spectra; each (S, L, n) or (S, L, N) for ``link``."""
+    """What effects add to the linear arm, as spectra; each (S, L, n) or (S, L, N) for ``link``.
+
+    ``steady``: those of laws that the arm moves as they were solved, from which others go on; None where one was not.
+    """
 
     spring: np.ndarray | float = 0.0
     link: np.ndarray | float = 0.0
     motor: np.ndarray | float = 0.0
+    steady: tuple[Steady | None, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +12,10 @@ from ident.chain import Structure
 from ident.graybox import Parameters, damping_diagonal, rotor_inertia, stiffness_diagonal
 from ident.group import Group, signal_share
 from ident.hypotheses import kernels
-from ident.hypotheses.loop import Steady, modal_state, steady_loop
+from ident.hypotheses.loop import modal_state, steady_loop
 from ident.inverse import Plane
 from ident.model import Effect, has_loop, is_along_record, is_dry
-from ident.motion import Motion, Solution, Torques
+from ident.motion import Motion, Solution, Steady, Torques
 from ident.records import POINTS_PER_LINE
 
 LOOP_REFINEMENT = 2  # time grid of a loop, in multiples of that of the laws of periodic data, at least
@@ -37,7 +37,6 @@ def inner_torques(
     motors: Sequence[Effect],
     given: np.ndarray | None,
     along: frozenset[int],
-    steady: MutableMapping[int, Steady],
 ) -> Torques:
     """Spring and link torques of effects, solved together with the arm they act on.
 
@@ -47,7 +46,6 @@ def inner_torques(
     Args:
         effects: in the gears and on the links; motors: at the motors; given: what the motors deliver, of ``delivered``;
             along: joints that are predicted along the record.
-        steady: loops of the pass before by their number, with which they begin; those of this one take their place.
     """
     S, L, n = solution.Q.shape
     motor = np.zeros((S, L, n), complex)
@@ -68,8 +66,9 @@ def inner_torques(
     at_motors = motor_torques(par, motion, motors) if motors else 0.0
     old_gear = solution.torques.spring + np.zeros((S, L, n), complex)
     old_link = solution.torques.link + np.zeros((S, L, structure.n_coordinates), complex)
-    alone = len(effects) == 1
-    for number, effect in enumerate(loops):
+    alone, steady = len(effects) == 1, list[Steady | None]()
+    before = [*solution.torques.steady, *[None] * len(loops)]
+    for effect, near in zip(loops, before, strict=False):
         j, c = effect.hypothesis.joint, structure.driven[effect.hypothesis.joint]
         compliance = plane.A_inv[:, c, c]
         grid, modes = _modes(structure, par, plane, group, c)
@@ -79,7 +78,7 @@ def inner_torques(
             noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=False))
             free = solution.Q_driven[..., j] + compliance * guess
             law = effect.hypothesis.options["loop"](effect.p)
-            torque, steady[number] = _loop(law, grid, free, noise, compliance, modes, guess, steady.get(number), alone)
+            torque, made = _loop(law, grid, free, noise, compliance, modes, guess, near, alone)
             at_link[j] = others + torque
         else:
             others = at_gear.get(j, 0.0)
@@ -88,19 +87,19 @@ def inner_torques(
                 said, left = _along_record(law, par, plane, group, motion, j, c, others, motor + at_motors)
                 at_gear[j] = others + said
                 motor[..., j] += left
+                made = None
             else:
                 guess = old_gear[..., j] - others
                 noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=True))
                 free = solution.delta[..., j] + compliance * guess
-                torque, steady[number] = _loop(
-                    law, grid, free, noise, compliance, modes, guess, steady.get(number), alone
-                )
+                torque, made = _loop(law, grid, free, noise, compliance, modes, guess, near, alone)
                 at_gear[j] = others + torque
+        steady.append(made)
     for j, value in at_gear.items():
         old_gear[..., j] = value
     for j, value in at_link.items():
         old_link[..., structure.driven[j]] = value
-    return Torques(spring=old_gear, link=old_link, motor=motor)
+    return Torques(spring=old_gear, link=old_link, motor=motor, steady=tuple(steady))
 
 
 def motor_torques(par: Parameters, motion: Motion, effects: Sequence[Effect]) -> np.ndarray:
@@ -228,7 +227,7 @@ def _loop(
 
     Args:
         free: (S, L) where the arm would be without; noise: (L,) variance of its lines; compliance: (L,) of the arm
-            there; guess: (S, L) torque to begin with, where no steady state ``near`` is known;
+            there; guess: (S, L) torque to begin with, where no steady state ``near`` serves;
             alone: whether no other law is solved with it.
     """
     share = signal_share(free, noise)
@@ -236,7 +235,7 @@ def _loop(
     x = grid.to_time(shown[..., None])[..., 0]
     rate = grid.to_time((1j * grid.omega * shown)[..., None])[..., 0] if kernels.sees_rate(law) else x
     step = grid.period_time / grid.n_time
-    start = modal_state(guess, grid.omega, step, modes) if near is None else None
+    start = modal_state(guess, grid.omega, step, modes)
     made = steady_loop(law, x, rate, modes, start, near=near, alone=alone, returns=grid.recorded_share, step=step)
     torque = grid.to_lines(made.torque[..., None])[..., 0]
     slope = kernels.mean_slope(law, grid.to_time((shown - compliance * torque)[..., None])[..., 0])[:, None]

@@ -490,6 +490,8 @@ def modal_compliance(M: np.ndarray, D: np.ndarray, K: np.ndarray, column: int, d
     real = np.abs(poles.imag) <= 1e-9
     poles = np.concatenate([poles[upper], poles[real]])
     residue = np.concatenate([2 * residue[upper], residue[real]])
+    order = np.lexsort((poles.real, poles.imag))  # the same of arms near by, which go on from each other
+    poles, residue = poles[order], residue[order]
     z = poles * dt
     decay = np.exp(z)
     phi1 = np.expm1(z) / z

@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ident.hypotheses.kernels import CABLE, HYSTERESIS, LINK, Law, along_motion, loop_sweep
 from ident.mixing import MEMORY, mixed
+from ident.motion import Steady
 
 SWEEPS = 25  # periods at most until the steady state
 # change of the torque from one to the next, over the largest, that ends them: derivatives are differences
 STEADY = 1e-7
 STEADY_BESIDE_OTHERS = 1e-6  # the same of one that is solved again until it agrees with others
-
-
-@dataclass(frozen=True)
-class Steady:
-    """A law in steady state with the arm.
-
-    Attributes:
-        torque: (S, T) N m.
-        start: (modes, S) complex state one step before the period; memory: (3, S) what the law remembers there.
-    """
-
-    torque: np.ndarray
-    start: np.ndarray
-    memory: np.ndarray
 
 
 def steady_loop(
@@ -53,7 +38,8 @@ def steady_loop(
         linear, rate: (S, T) position and velocity without the law, rad, rad/s; the latter for laws that see it alone.
         modes: (4, modes) complex, of ``kernels.modal_compliance``.
         guess: (modes, S) complex state from which to begin; rest where None.
-        near: steady state of the same law in nearly the same motion, from which to begin instead.
+        near: steady state of the same law in nearly the same motion, from which to begin instead, where it has as many
+            points and modes.
         alone: whether no other law is solved until it agrees with this one.
         returns: share of the period from which on it is but a return that closes a motion, in which what yields comes
             to the ``start`` of the law; 1 where there is none.
@@ -70,7 +56,8 @@ def steady_loop(
     whole = (decay**T)[:, None]
     linear, rate = np.ascontiguousarray(linear.T), np.ascontiguousarray(rate.T)
     start = np.zeros((len(decay), S), complex) if guess is None else guess
-    if near is not None:
+    goes_on = near is not None and near.torque.shape == (S, T) and near.start.shape == start.shape
+    if near is not None and goes_on:
         start, memory, part = near.start.copy(), near.memory.copy(), near.torque.T.copy()
     else:
         memory, part = _at_first(law, linear, rate, poles, start), np.zeros((T, S))
@@ -83,7 +70,7 @@ def steady_loop(
         end, change = loop_sweep(*shape, linear, rate, modes, start, memory, part, last, b * law.start)
         # The state that the torque of this period repeats.
         move = (end - whole * start) / (1.0 - whole) - start
-        moving = change > enough if sweep or near is not None else np.ones(len(left), bool)
+        moving = change > enough if sweep or goes_on else np.ones(len(left), bool)
         if remembers:
             start, move = np.vstack([start, before / unit]), np.vstack([move, (memory - before) / unit])
         past = [*past[-MEMORY:], (start.T, move.T)]
