@@ -332,6 +332,14 @@ def test_torques_are_shown_at_the_joints_of_the_gain_first():
     assert shown == [list("bde"), list("bcd"), list("acf")]
 
 
+def test_the_same_data_are_the_same_picture():
+    t = np.arange(50.0)
+    measured = np.sin(t)[:, None]
+    trace = TorqueTrace("s", t, measured, 0.9 * measured, measured, measured)
+    first, again = (trace_figure(trace, ("a",), ("N m",)) for _ in range(2))
+    assert "url(#" in first and first == again
+
+
 def test_figures_leave_the_callers_matplotlib_alone():
     code = "import matplotlib as m; m.use('svg'); import ident.show.figures; assert m.get_backend() == 'svg'"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
