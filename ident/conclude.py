@@ -21,6 +21,7 @@ from ident.notes import (
     along_note,
     belied_note,
     drift_note,
+    excitation_note,
     faint_note,
     few_note,
     held_out_note,
@@ -284,6 +285,8 @@ def notes_on(found: Findings, causes: Sequence[Cause], tones: Sequence[Tone], de
         yield step_note(problem.steps)
     if problem.sampling.roll_off:
         yield roll_off_note(problem)
+    if problem.sampling.late_excitation:
+        yield excitation_note(problem)
     if found.gain is None and not found.setup.held_out:
         yield "No gain is measured: nothing is held out, and of a single operating point nothing can be left out."
 

@@ -30,6 +30,7 @@ class Group:
         U, Q: (S, L, n) mean spectra of torque (N m) and motor position (rad), lines 0..L-1.
         U_periods, Q_periods: (S, P, L, n) single periods, P >= 1.
         Q_link: (S, L, n) of the link encoders, or None.
+        R: (S, L, n) of the excitation, in its own unit; None of a motion, and where it is not recorded.
         link_std: (n,) sample noise of the link encoders of a motion, rad, NaN where a joint has none; or None.
         links: joints whose link encoder is compared, M of them.
         n_slow: lines of the motion along which the geometry of the arm is solved, all where None.
@@ -90,6 +91,7 @@ class Group:
     alike_turn_noise: np.ndarray | None = None
     creeps: bool = False
     steps: TimeSteps | None = None
+    R: np.ndarray | None = None
 
     @property
     def shows_noise(self) -> bool:
@@ -224,6 +226,7 @@ class Group:
             "U_periods",
             "Q_periods",
             "Q_link",
+            "R",
             "excited",
             "amplitude",
             "start",
@@ -239,7 +242,7 @@ class Group:
 
     def slow(self) -> Group:
         """The group with the lines of the geometry alone."""
-        names = ("U", "Q", "U_periods", "Q_periods", "Q_link")
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "R")
         parts = {name: getattr(self, name) for name in names}
         cut: dict[str, Any] = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
         return replace(

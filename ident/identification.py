@@ -15,6 +15,7 @@ from ident.extended import Prediction
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from ident.group import Group
 from ident.inverse import Sampling
+from ident.late_excitation import acting, with_late_excitation
 from ident.noise import (
     DOUBT,
     alike_at_all_lines,
@@ -169,10 +170,13 @@ def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None)
 
 
 def first_model(dataset: Dataset, setup: Setup, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:
-    """The setup with what the record of the torque loses, and under the noise that is seen beside the drives; the drives
-    that fit it."""
-    problem, result = with_roll_off(setup.problem, fit_baseline(setup.problem, progress))
-    setup = replace(setup, problem=problem)
+    """The setup with the torque that acts and what its record loses, and under the noise that is seen beside the drives;
+    the drives that fit it."""
+    told = setup.problem.sampling.late_excitation
+    problem, result = with_late_excitation(setup.problem, fit_baseline(setup.problem, progress))
+    more = problem.sampling.late_excitation - told
+    problem, result = with_roll_off(problem, result)
+    setup = replace(setup, problem=problem, held_out=tuple(acting(g, more) for g in setup.held_out))
     louder = with_noise_of_unexcited_lines(dataset, setup.problem, result)
     if louder is not setup.problem:
         setup = replace(setup, problem=louder)

@@ -55,12 +55,14 @@ REACTION_CHANGE = 1e-5  # relative change that ends them
 
 @dataclass(frozen=True)
 class Sampling:
-    """How torque and position were sampled: sample time, s, the hold of the torque, and what its record loses towards
-    high frequencies at all joints alike, s2 (``roll_off``)."""
+    """How torque and position were sampled: sample time, s, the hold of the torque, what its record loses towards
+    high frequencies at all joints alike, s2 (``roll_off``), and by how much later than recorded an excitation acts, s
+    (``late_excitation``)."""
 
     sample_time: float
     hold: str
     roll_off: float = 0.0
+    late_excitation: float = 0.0
 
 
 @dataclass(frozen=True)

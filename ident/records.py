@@ -123,6 +123,9 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
     link = None
     if all(s.q_link is not None for s in members):
         link = np.stack([_lines(_steady(s, "q_link"), n_lines).mean(axis=0) for s in members])
+    excitation = None
+    if all(s.r is not None for s in members):
+        excitation = np.stack([_lines(s.periodic("r"), n_lines).mean(axis=0) for s in members])
     excited = np.zeros((len(members), n_lines), bool)
     for i, s in enumerate(members):
         lines = np.asarray(s.excited_lines, int)
@@ -156,6 +159,7 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
         noise_spacing=spacing,
         U_noise=noise[0],
         Q_noise=noise[1],
+        R=excitation,
         creeps=any(len(x) == 1 and np.any(x != s.periodic("q")) for x, s in zip(q, members, strict=True)),
     )
     return replace(group, rest=group.rest | turning(group))

@@ -21,6 +21,7 @@ from ident.identification import (
     with_noise_of_fast_lines,
     with_steps_of,
 )
+from ident.late_excitation import acting
 from ident.left_out import SEED, errors_on_parts
 from ident.link_sensor import comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect
@@ -189,10 +190,14 @@ def by_link_encoders(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: 
         predictions(setup.problem, baseline.model, baseline.remainders),
         setup.problem.sampling.sample_time,
     )
-    wide = set_up(dataset, fast=True)
-    recorded = wide.problem.groups
-    both, told = with_link_encoders(wide.problem, late), setup.problem
-    wide = replace(wide, problem=replace(both, q_std=told.q_std, tau_std=told.tau_std, sampling=told.sampling))
+    wide, told = set_up(dataset, fast=True), setup.problem
+    recorded, held_out = (
+        tuple(acting(g, told.sampling.late_excitation) for g in groups)
+        for groups in (wide.problem.groups, wide.held_out)
+    )
+    both = with_link_encoders(replace(wide.problem, groups=recorded), late)
+    both = replace(both, q_std=told.q_std, tau_std=told.tau_std, sampling=told.sampling)
+    wide = replace(wide, problem=both, held_out=held_out)
     half = workers.for_half()
     try:
         fitted = fit_baseline(wide.problem, workers.say)

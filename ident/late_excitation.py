@@ -1,0 +1,68 @@
+"""Excitations that are held from sample to sample while a faster loop works between them.
+
+What a controller adds acts as it is recorded, up to a delay that all torques share. What is asked of it from outside,
+once a sample, acts later by up to as long as it is held: ``acting = recorded + (exp(-s lag) - 1) r``. An effect of the
+catalogue has one joint; such a controller has all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ident.baseline import renewed
+from ident.derivatives import jacobians
+from ident.group import Group
+from ident.problem import Problem, predictions
+from ident.roll_off import LEAST_JOINTS, STEPS, agreed, told_by_most
+from ident.torque_fit import RIDGE, Fit, inverse, left_beside
+
+
+def with_late_excitation(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
+    """A problem with the torque that acts, and its fit, where most joints share a lag of the excitation; as they are
+    where that explains little of what most of them leave."""
+    first, start = result, problem
+    for _ in range(STEPS):
+        more = shared_lag(problem, result)
+        if not more:
+            break
+        sampling = replace(problem.sampling, late_excitation=problem.sampling.late_excitation + more)
+        problem = replace(problem, sampling=sampling, groups=tuple(acting(g, more) for g in problem.groups))
+        result = renewed(problem, result)
+    return (problem, result) if told_by_most(first, result) else (start, first)
+
+
+def acting(group: Group, lag: float) -> Group:
+    """A group with the torque that acts where its excitation does so by ``lag``, s, later than it is recorded; as it is
+    where it holds no excitation."""
+    if group.R is None or not lag:
+        return group
+    late = np.exp(-1j * group.omega[:, None] * lag) * group.R
+    change = late - group.R
+    return replace(group, U=group.U + change, U_periods=group.U_periods + change[:, None], R=late)
+
+
+def shared_lag(problem: Problem, result: Fit) -> float:
+    """Lag of the excitation, s, that a fit leaves in the torque of most joints; 0 where there is none, or where it cannot
+    be told.
+
+    A linear step, each joint with a lag of its own, beside the coordinates of the fit. Most joints must agree: an
+    excitation that is no torque, as the reference of a position, has a gain of its own at each.
+    """
+    n = problem.structure.n
+    if problem.sampling.hold != "none" or n < LEAST_JOINTS or any(g.R is None for g in problem.groups):
+        return 0.0
+    preds = predictions(problem, result.model, result.remainders)
+    made, lost = jacobians(problem, result.model, preds, exact=False), []
+    for columns, pred, group in zip(made, preds, problem.groups, strict=True):
+        S, top, outputs, _ = columns.whole.shape
+        assert group.R is not None  # of none that has no excitation
+        each = np.zeros((S, top, outputs, n), complex)
+        for j in range(n):
+            each[..., j, j] = pred.plane.s[:top] * group.R[:, :top, j]
+        lost.append(each)
+    curvature, slope = left_beside(problem, result, preds, made, lost)
+    covariance = inverse(curvature, RIDGE)
+    std = np.sqrt(max(result.chi2_per_dof, 1.0) * np.diag(covariance))
+    return agreed(covariance @ slope, std, problem.sampling.sample_time)
