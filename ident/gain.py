@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -85,8 +85,10 @@ def in_recorded_motion(pred: Prediction) -> Told:
         nearer, chosen = _left_of(other) < CLEARLY * _left_of(pred), pred
         if np.any(nearer):
             a, b, here = pred.solution, other.solution, nearer[:, None, None]
-            torques = Torques(
-                *(np.where(here, y, x) for x, y in zip(astuple(a.torques), astuple(b.torques), strict=True))
+            torques = Torques(  # from which loops begin
+                np.where(here, b.torques.spring, a.torques.spring),
+                np.where(here, b.torques.link, a.torques.link),
+                np.where(here, b.torques.motor, a.torques.motor),
             )
             W = np.where(here, b.W, a.W)
             chosen = predict(model, group, pred.sampling, W=W, torques=torques, steps=REMAINDER_STEPS)

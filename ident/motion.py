@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,13 +31,14 @@ class Steady:
 class Torques:
     """What effects add to the linear arm, as spectra; each (S, L, n) or (S, L, N) for ``link``.
 
-    ``steady``: those of laws that the arm moves as they were solved, from which others go on; None where one was not.
+    ``steady``: of laws that the arm moves, by the ``key`` of their hypothesis, as they were solved, from which others go
+    on.
     """
 
     spring: np.ndarray | float = 0.0
     link: np.ndarray | float = 0.0
     motor: np.ndarray | float = 0.0
-    steady: tuple[Steady | None, ...] = ()
+    steady: Mapping[tuple[str, str], Steady] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

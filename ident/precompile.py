@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.chain import build_structure
+from ident.compliance import link_compliance
 from ident.hypotheses.friction import direction
 from ident.hypotheses.kernels import BACKLASH, HYSTERESIS, Law, along_motion
 from ident.hypotheses.loop import steady_loop
@@ -19,6 +20,8 @@ from robot_assets.robot import load_robot
 def precompile() -> None:
     """Call what a diagnosis calls of compiled code, with next to no data."""
     still, mode = np.zeros((1, 4)), np.full((4, 1), 1e-3 + 0j)
+    one, line = np.ones((1, 1)), np.zeros(1, complex)
+    link_compliance(one, one, one[0], one[0], line, line)
     newton_euler(chain_of(build_structure(load_robot("twomass")).model), *np.zeros((3, 1, 1)))
     direction(still, 1e-3)
     bristle(still, 1e-3, 1e-3, start=np.zeros(1))

@@ -66,9 +66,10 @@ def inner_torques(
     at_motors = motor_torques(par, motion, motors) if motors else 0.0
     old_gear = solution.torques.spring + np.zeros((S, L, n), complex)
     old_link = solution.torques.link + np.zeros((S, L, structure.n_coordinates), complex)
-    alone, steady = len(effects) == 1, list[Steady | None]()
-    before = [*solution.torques.steady, *[None] * len(loops)]
-    for effect, near in zip(loops, before, strict=False):
+    alone, steady = len(effects) == 1, dict[tuple[str, str], Steady]()
+    for effect in loops:
+        key = effect.hypothesis.key
+        near = solution.torques.steady.get(key)
         j, c = effect.hypothesis.joint, structure.driven[effect.hypothesis.joint]
         compliance = plane.A_inv[:, c, c]
         grid, modes = _modes(structure, par, plane, group, c)
@@ -78,7 +79,7 @@ def inner_torques(
             noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=False))
             free = solution.Q_driven[..., j] + compliance * guess
             law = effect.hypothesis.options["loop"](effect.p)
-            torque, made = _loop(law, grid, free, noise, compliance, modes, guess, near, alone)
+            torque, steady[key] = _loop(law, grid, free, noise, compliance, modes, guess, near, alone)
             at_link[j] = others + torque
         else:
             others = at_gear.get(j, 0.0)
@@ -87,19 +88,17 @@ def inner_torques(
                 said, left = _along_record(law, par, plane, group, motion, j, c, others, motor + at_motors)
                 at_gear[j] = others + said
                 motor[..., j] += left
-                made = None
             else:
                 guess = old_gear[..., j] - others
                 noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=True))
                 free = solution.delta[..., j] + compliance * guess
-                torque, made = _loop(law, grid, free, noise, compliance, modes, guess, near, alone)
+                torque, steady[key] = _loop(law, grid, free, noise, compliance, modes, guess, near, alone)
                 at_gear[j] = others + torque
-        steady.append(made)
     for j, value in at_gear.items():
         old_gear[..., j] = value
     for j, value in at_link.items():
         old_link[..., structure.driven[j]] = value
-    return Torques(spring=old_gear, link=old_link, motor=motor, steady=tuple(steady))
+    return Torques(spring=old_gear, link=old_link, motor=motor, steady=steady)
 
 
 def motor_torques(par: Parameters, motion: Motion, effects: Sequence[Effect]) -> np.ndarray:

@@ -110,7 +110,7 @@ def most_explained(
     """Gain of the best of all hypotheses in each of ``others``: the same motions with other torques; (R,).
 
     The unit responses are those of the motions, and made once for all of them; ripples are asked at the wave numbers
-    that any of them shows.
+    that any of them shows, and hinges for resonances that are taken away too.
     """
     stage = _Stage.build(problem, fit, predictions, others)
 

@@ -11,7 +11,7 @@ from ident.attribute import Attribution
 from ident.diagnosis import diagnose
 from ident.gain import Errors, line_squares, mean_squares, measure_gain
 from ident.model import Effect, Model
-from ident.motion import Torques
+from ident.motion import Steady, Torques
 from ident.notes import along_note, chosen_motion_note
 from ident.verdict import UNKNOWN
 from sim import parse_effect
@@ -139,7 +139,8 @@ def test_each_record_is_predicted_in_the_steady_motion_that_its_torque_tells(mon
     def predicted(model, off):
         """Off by so much in each record; of states by which the start of the next prediction is told."""
         state = np.array(off)[:, None, None] * np.ones((2, 3, 1))
-        solution = SimpleNamespace(W=state, torques=Torques(spring=state))
+        steady = {("a", "b"): Steady(np.zeros((2, 8)), np.zeros((1, 2), complex), np.zeros((3, 2)))}
+        solution = SimpleNamespace(W=state, torques=Torques(spring=state, steady=steady))
         return SimpleNamespace(model=model, group=group, sampling=None, solution=solution, U=measured + state)
 
     def predict(model, group, sampling, *, W=None, torques=None, steps=None):

@@ -1,13 +1,17 @@
 """Laws in steady state with the arm that they move."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.hypotheses import kernels
+from ident.extended import predict
+from ident.hypotheses import catalogue, kernels
 from ident.hypotheses.loop import modal_state, steady_loop
 from ident.hypotheses.yielding import along_path, elastoplastic, onward
+from ident.model import Effect
 from tests.conftest import over_steps
 
 PERIOD, POINTS = 2.0, 12000  # s, of the grid
@@ -205,3 +209,33 @@ def test_torque_of_a_cable_at_a_point(stiffness, friction, turn, q, v, dq, dv):
     slope = 1.0 + stiffness * dq + friction * dv / turn  # of the equation in h, at most
     miss = h - stiffness * (q - dq * h) - friction * np.tanh((v - dv * h) / turn)
     assert abs(miss) <= 1e-7 * (abs(h) + friction) * slope + 1e-300
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_loops_go_on_from_the_steady_states_of_their_own_laws(identified, monkeypatch, turned):
+    """In whatever order a model has them."""
+    _, setup, result = identified
+    named = {h.key: h for h in catalogue(setup.problem.structure)}
+    soft, cable = named["softening_stiffness", "elbow_joint"], named["dress_pack", "wrist_2_joint"]
+    sizes = {"low_stiffness": 0.6 * result.model.par.stiffness[2], "transition": 1e-4, "stiffness": 20.0}
+    effects = tuple(
+        Effect(h, np.array([sizes.get(q.name, 0.0 if q.lower <= 0.0 else 0.1) for q in h.parameters]))
+        for h in (soft, cable)
+    )
+    model, group = replace(result.model, effects=effects), setup.problem.groups[0]
+    begun: list = []
+
+    def spied(law, *args, near=None, **kwargs):
+        begun.append((law.code, near))
+        return steady_loop(law, *args, near=near, **kwargs)
+
+    monkeypatch.setattr("ident.reactions.steady_loop", spied)
+    first = predict(model, group, setup.problem.sampling)
+    made = first.solution.torques.steady
+    assert set(made) == {soft.key, cable.key} and begun[0][1] is None
+    begun.clear()
+    other = replace(model, effects=effects[::-1] if turned else effects)
+    again = predict(other, group, setup.problem.sampling, W=first.solution.W, torques=first.solution.torques)
+    own = {True: soft.key, False: cable.key}
+    assert all(near is made[own[code == kernels.SOFTENING]] for code, near in begun[:2])
+    assert np.abs(again.U - first.U).max() < 1e-5 * np.abs(first.U).max()

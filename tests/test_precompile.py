@@ -2,13 +2,14 @@
 
 import numpy as np
 
+from ident.compliance import _inverses
 from ident.hypotheses.kernels import BACKLASH, HYSTERESIS, Law, along_motion, loop_sweep, smooth_sign
 from ident.hypotheses.loop import steady_loop
 from ident.hypotheses.yielding import along_path, following, onward
 from ident.precompile import precompile
 from ident.recursion import recursion, sines
 
-COMPILED = (loop_sweep, smooth_sign, along_path, following, onward, recursion, sines)
+COMPILED = (_inverses, loop_sweep, smooth_sign, along_path, following, onward, recursion, sines)
 
 
 def test_records_that_settle_at_different_times_call_for_no_more_code():

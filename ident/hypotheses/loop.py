@@ -11,7 +11,9 @@ from ident.motion import Steady
 SWEEPS = 25  # periods at most until the steady state
 # change of the torque from one to the next, over the largest, that ends them: derivatives are differences
 STEADY = 1e-7
-STEADY_BESIDE_OTHERS = 1e-6  # the same of one that is solved again until it agrees with others
+# the same of one that is solved again until it agrees with others: of the parameters that show least, as the recoil of
+# a hysteresis, derivatives are then off by up to a hundredth
+STEADY_BESIDE_OTHERS = 1e-6
 
 
 def steady_loop(
