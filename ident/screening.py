@@ -29,6 +29,7 @@ NEAR_WAVE = 0.9  # of the gain of the best
 NEAR_ORDER = 0.5  # the same of a wave that a motor has: several of any length fit a few postures by chance
 SAME_WAVE = 0.02  # relative, of two
 RIPPLES = 0.5  # of the excess at its joint, from which a ripple is also begun at what motors have
+MISSING = 0.05  # of a unit resonance, from which one is missing
 SHIFT = 1e-4  # rad or m, of a position along which a motion is predicted once more
 
 
@@ -110,7 +111,7 @@ def most_explained(
     """Gain of the best of all hypotheses in each of ``others``: the same motions with other torques; (R,).
 
     The unit responses are those of the motions, and made once for all of them; ripples are asked at the wave numbers
-    that any of them shows, and hinges for resonances that are taken away too.
+    that any of them shows.
     """
     stage = _Stage.build(problem, fit, predictions, others)
 
@@ -242,10 +243,15 @@ def _best_gains(stage: _Stage, hypotheses: Sequence[Hypothesis], scales: Sequenc
     """Gain (R,) of the best shape of all hypotheses of ``side_by_side``."""
     fields, best = _fields(stage, hypotheses), np.zeros(stage.moment.shape[1])
     for h in hypotheses:
+        of_any, of_missing = np.zeros_like(best), np.zeros_like(best)
         for shape in h.shapes(scales[max(h.joint, 0)]):
             explained = _explained(stage, _unit_responses(stage, fields, h, shape)[0])
             if explained is not None:
-                best = np.maximum(best, explained[1])
+                c, gains = explained
+                of_any = np.maximum(of_any, gains)
+                missing = "hinge" in h.options and c[0] >= MISSING
+                of_missing = np.maximum(of_missing, np.where(missing, gains, 0.0))
+        best = np.maximum(best, np.where(of_missing > 0.0, of_missing, of_any))
     return best
 
 
@@ -410,7 +416,7 @@ def _start(start, c, h: Hypothesis, shape, problem: Problem) -> np.ndarray | Non
     if "hinge" in h.options:
         return (
             None
-            if c[0] < 0.05
+            if c[0] < MISSING
             else h.options["hinge"](problem.structure, problem.groups[0], *shape, softer=float(np.clip(c[0], 0.2, 3.0)))
         )
     p = start(c)

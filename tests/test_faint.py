@@ -166,7 +166,8 @@ def test_several_draws_are_held_against_all_hypotheses_as_each_of_them_alone(ide
         )
         for _ in range(3)
     ]
-    for some in ([h for h in hypotheses if not h.repeats], [h for h in hypotheses if h.repeats]):
+    hinges, laws = ([h for h in hypotheses if ("hinge" in h.options) is hinge] for hinge in (True, False))
+    for some in (hinges, [h for h in laws if not h.repeats], [h for h in laws if h.repeats]):
         each = [screen(other, current, preds, some)[0].gain for other in others]
         together = most_explained(setup.problem, current, preds, some, others)
         assert np.all(together >= (1.0 - 1e-6) * np.array(each))
