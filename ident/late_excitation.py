@@ -64,5 +64,5 @@ def shared_lag(problem: Problem, result: Fit) -> float:
         lost.append(each)
     curvature, slope = left_beside(problem, result, preds, made, lost)
     covariance = inverse(curvature, RIDGE)
-    std = np.sqrt(max(result.chi2_per_dof, 1.0) * np.diag(covariance))
+    std = np.sqrt(np.maximum(result.costs / result.counts, 1.0) * np.diag(covariance))
     return agreed(covariance @ slope, std, problem.sampling.sample_time)
