@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-FUSED = {"contract"}  # products with sums in one instruction
+from ident.recursion import FUSED
 
 
 def link_compliance(

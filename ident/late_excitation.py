@@ -12,11 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from ident.baseline import renewed
-from ident.derivatives import jacobians
 from ident.group import Group
-from ident.problem import Problem, predictions
-from ident.roll_off import LEAST_JOINTS, STEPS, agreed, told_by_most
-from ident.torque_fit import RIDGE, Fit, inverse, left_beside
+from ident.problem import Problem
+from ident.roll_off import LEAST_JOINTS, STEPS, agreed, of_each_joint, told_by_most
+from ident.torque_fit import Fit
 
 
 def with_late_excitation(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
@@ -47,22 +46,12 @@ def shared_lag(problem: Problem, result: Fit) -> float:
     """Lag of the excitation, s, that a fit leaves in the torque of most joints; 0 where there is none, or where it cannot
     be told.
 
-    A linear step, each joint with a lag of its own, beside the coordinates of the fit. Most joints must agree: an
+    Each joint has a lag of its own in a linear step. Most must agree: an
     excitation that is no torque, as the reference of a position, has a gain of its own at each.
     """
-    n = problem.structure.n
-    if problem.sampling.hold != "none" or n < LEAST_JOINTS or any(g.R is None for g in problem.groups):
+    known = all(g.R is not None for g in problem.groups)
+    if problem.sampling.hold != "none" or problem.structure.n < LEAST_JOINTS or not known:
         return 0.0
-    preds = predictions(problem, result.model, result.remainders)
-    made, lost = jacobians(problem, result.model, preds, exact=False), []
-    for columns, pred, group in zip(made, preds, problem.groups, strict=True):
-        S, top, outputs, _ = columns.whole.shape
-        assert group.R is not None  # of none that has no excitation
-        each = np.zeros((S, top, outputs, n), complex)
-        for j in range(n):
-            each[..., j, j] = pred.plane.s[:top] * group.R[:, :top, j]
-        lost.append(each)
-    curvature, slope = left_beside(problem, result, preds, made, lost)
-    covariance = inverse(curvature, RIDGE)
-    std = np.sqrt(np.maximum(result.costs / result.counts, 1.0) * np.diag(covariance))
-    return agreed(covariance @ slope, std, problem.sampling.sample_time)
+    own, variance = of_each_joint(problem, result, lambda group, pred: pred.plane.s[:, None] * group.R)
+    std = np.sqrt(np.maximum(result.costs / result.counts, 1.0) * variance)
+    return agreed(own, std, problem.sampling.sample_time)

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ident.graybox import Linearisation, Parameters, equilibrium, impedance, linearise
+from ident.graybox import Linearisation, Parameters, equilibrium, impedance, linearise, rotor_inertia
 from ident.group import Group
 from ident.inverse import torque_record
 from ident.model import Effect, Model
@@ -236,8 +236,8 @@ def _cost(
     total, count = 0.0, 0
     for x, record, Z in zip(spectra, records, links, strict=True):
         rate, square = (d[:, None] for d in differences(1j * x.group.omega, x.group.steps))
-        beside = 0.0 if x.group.steps is None else x.group.steps.apart
-        motors = square * (par.inertia + beside * par.viscous) + rate * par.viscous
+        alone = replace(par, damping=np.zeros_like(par.damping))  # gears are among the links
+        motors = square * rotor_inertia(alone, x.group.steps) + rate * par.viscous
         torque = record[:, None] * (np.matmul(Z, x.position[..., None])[..., 0] + motors * x.position)
         with np.errstate(divide="ignore", invalid="ignore"):
             left = np.abs(np.log(torque / x.torque)[x.seen]) ** 2

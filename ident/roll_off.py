@@ -7,12 +7,15 @@ one joint; a recorder has all of them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from ident.baseline import DETECTION_EXCESS, renewed
 from ident.derivatives import jacobians
+from ident.extended import Prediction
+from ident.group import Group
 from ident.problem import Problem, predictions
 from ident.torque_fit import RIDGE, Fit, inverse, left_beside
 
@@ -56,19 +59,31 @@ def shared_roll_off(problem: Problem, result: Fit) -> float:
     n = problem.structure.n
     if problem.sampling.hold != "none" or problem.motions_alone or n < LEAST_JOINTS:
         return 0.0
+    own, variance = of_each_joint(problem, result, lambda _, pred: pred.plane.s[:, None] ** 2 * pred.U)
+    std = np.sqrt(max(result.chi2_per_dof, 1.0) * variance)
+    return agreed(own, std, LARGEST * problem.sampling.sample_time**2)
+
+
+def of_each_joint(
+    problem: Problem, result: Fit, signal: Callable[[Group, Prediction], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How much of a signal a fit leaves in the torque of each joint, by a linear step beside its coordinates, and the
+    variance of that by noise; (n,) each.
+
+    Args:
+        signal: of a group and what is predicted for it, (S, L, n) N m per unit.
+    """
+    n = problem.structure.n
     preds = predictions(problem, result.model, result.remainders)
     made, lost = jacobians(problem, result.model, preds, exact=False), []
-    for columns, pred in zip(made, preds, strict=True):
+    for columns, pred, group in zip(made, preds, problem.groups, strict=True):
         S, top, outputs, _ = columns.whole.shape
         each = np.zeros((S, top, outputs, n), complex)
-        for j in range(n):
-            each[..., j, j] = (pred.plane.s[:top] ** 2) * pred.U[:, :top, j]
+        each[..., range(n), range(n)] = signal(group, pred)[:, :top]
         lost.append(each)
     curvature, slope = left_beside(problem, result, preds, made, lost)
     covariance = inverse(curvature, RIDGE)
-    own = covariance @ slope
-    std = np.sqrt(max(result.chi2_per_dof, 1.0) * np.diag(covariance))
-    return agreed(own, std, LARGEST * problem.sampling.sample_time**2)
+    return covariance @ slope, np.diag(covariance)
 
 
 def agreed(values: np.ndarray, std: np.ndarray, limit: float) -> float:

@@ -1295,6 +1295,10 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
         given.append(cause.probability)
     assert given[0] > 0.9 and given[1] < 0.5
     monkeypatch.setattr("ident.conclude.shown", lambda *args: True)
+    with monkeypatch.context() as patched:
+        patched.setattr("ident.conclude.piece_of_a_curve", lambda *args: True)
+        (cause,) = conclude(Findings(data, setup, worse, heard, preds, preds)).causes
+        assert cause.probability < 0.5
     verdict = conclude(Findings(data, setup, worse, heard, preds, preds, belied={h.key}))
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
     assert any("hysteresis at elbow_joint" in note and "held out" in note for note in verdict.notes)

@@ -58,8 +58,9 @@ def steady_loop(
     whole = (decay**T)[:, None]
     linear, rate = np.ascontiguousarray(linear.T), np.ascontiguousarray(rate.T)
     start = np.zeros((len(decay), S), complex) if guess is None else guess
-    goes_on = near is not None and near.torque.shape == (S, T) and near.start.shape == start.shape
-    if near is not None and goes_on:
+    if near is not None and (near.torque.shape != (S, T) or near.start.shape != start.shape):
+        near = None
+    if near is not None:
         start, memory, part = near.start.copy(), near.memory.copy(), near.torque.T.copy()
     else:
         memory, part = _at_first(law, linear, rate, poles, start), np.zeros((T, S))
@@ -72,7 +73,7 @@ def steady_loop(
         end, change = loop_sweep(*shape, linear, rate, modes, start, memory, part, last, b * law.start)
         # The state that the torque of this period repeats.
         move = (end - whole * start) / (1.0 - whole) - start
-        moving = change > enough if sweep or goes_on else np.ones(len(left), bool)
+        moving = change > enough if sweep or near is not None else np.ones(len(left), bool)
         if remembers:
             start, move = np.vstack([start, before / unit]), np.vstack([move, (memory - before) / unit])
         past = [*past[-MEMORY:], (start.T, move.T)]
