@@ -24,6 +24,7 @@ test test-all: export SIMGAP_THREADS = 1
 test: $(STAMP)
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadgroup
 
+test-all: export HYPOTHESIS_PROFILE = random
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 

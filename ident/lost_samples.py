@@ -129,10 +129,11 @@ def _clear(runs: Runs, count: float) -> int:
 
 def _repeats(runs: Runs, count: float) -> np.ndarray:
     """(N,) samples that repeat the one before, of an encoder with counts those alone after which it skips some: slow
-    motion repeats the others."""
+    motion repeats the others. The last value is taken to be followed by a step as large as the one to it."""
     short = (runs.lengths > 1) & (runs.lengths <= LONGEST)
     if count:
-        short &= np.append(np.abs(np.diff(runs.values)) > STEPS * count, False)
+        values = runs.values
+        short &= np.abs(np.diff(values, append=2.0 * values[-1] - values[-2:][0])) > STEPS * count
     again = np.repeat(short, runs.lengths)
     again[runs.starts] = False
     return again

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import tomlkit
+from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 from ident.dataset import Dataset
@@ -14,6 +17,10 @@ from ident.identification import identify
 from robot_assets.robot import load_robot
 from sim import run_experiment
 from sim.experiment import draw_drives, plan_experiment
+
+settings.register_profile("repeatable", derandomize=True)  # the default suite says the same of the same code
+settings.register_profile("random")
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 threadpool_limits(1)  # workers share the cores: threads of each would only wait for each other, ten times as long
 

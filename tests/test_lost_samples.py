@@ -91,6 +91,19 @@ def test_what_was_lost_is_found_and_filled(seed, highest, noise, step, share):
     assert error < 0.1 * np.std(held - whole) + 2.0 * np.sqrt(share) * (noise + step)
 
 
+@pytest.mark.parametrize("step", [0.0, 1e-7])
+def test_the_last_sample_can_be_lost_too(step):
+    """Nothing after it tells, so that it goes on as the motion before it did; one that rests at the end is whole."""
+    rng = np.random.default_rng(2126)
+    whole = motion(rng, 4000, 10.0) + 1e-7 * rng.standard_normal(4000)
+    whole = step * np.round(whole / step) if step else whole
+    held, lost = with_loss(rng, whole, 0.03)
+    held[-1], lost[-1] = held[-2], True
+    found, resting = lost_among([held, np.full(50, whole[0])])[0]
+    assert found[-1] and not np.any(resting)
+    assert abs(filled(held, found)[-1] - whole[-1]) < 0.2 * abs(held[-1] - whole[-1])
+
+
 @pytest.mark.parametrize("every", [2, 3])
 @pytest.mark.parametrize("coarse", [0.0, 0.3])
 def test_a_slower_clock_is_none_that_loses(clean, every, coarse):
