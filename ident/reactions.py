@@ -63,11 +63,12 @@ def inner_torques(
             motor[..., j] += motion.lines(torque)
         else:
             at_link[j] = at_link.get(j, 0.0) + motion.lines(h.law(effect.p, motion, j, par.stiffness[j]))
-    at_motors = motor_torques(par, motion, motors) if motors else 0.0
+    by_record = [e.hypothesis.joint in along and is_along_record(e.hypothesis) for e in loops]
+    at_motors = motor_torques(par, motion, motors) if any(by_record) and motors else 0.0
     old_gear = solution.torques.spring + np.zeros((S, L, n), complex)
     old_link = solution.torques.link + np.zeros((S, L, structure.n_coordinates), complex)
     alone, steady = len(effects) == 1, dict[tuple[str, str], Steady]()
-    for effect in loops:
+    for effect, said_by_record in zip(loops, by_record, strict=True):
         key = effect.hypothesis.key
         near = solution.torques.steady.get(key)
         j, c = effect.hypothesis.joint, structure.driven[effect.hypothesis.joint]
@@ -84,7 +85,7 @@ def inner_torques(
         else:
             others = at_gear.get(j, 0.0)
             law = effect.hypothesis.law(effect.p, None, par.stiffness[j])
-            if j in along and is_along_record(effect.hypothesis):
+            if said_by_record:
                 said, left = _along_record(law, par, plane, group, motion, j, c, others, motor + at_motors)
                 at_gear[j] = others + said
                 motor[..., j] += left
