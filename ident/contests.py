@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ident.baseline import DETECTION_EXCESS, FAINT
 from ident.evidence import Candidate, errors_by_joint, weigh
-from ident.hypotheses import Hypothesis, catalogue
+from ident.hypotheses import Hypothesis, catalogue, second_order
 from ident.hypotheses.bodies import payload, payload_like
 from ident.hypotheses.hypothesis import RIPPLE
 from ident.model import Effect
@@ -60,7 +60,12 @@ def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: 
         winner = found.candidates[0].hypothesis
         there = {e.hypothesis.key for e in current.model.effects}
         blurred = len(there) > 1 or outdone(found) or nearly_settled(problem, current, winner)
-        if blurred and winner.key in there and not winner.decoy and not workers.late:
+        if (
+            (blurred or wider_laws(problem, current, winner))
+            and winner.key in there
+            and not winner.decoy
+            and not workers.late
+        ):
             current, found = contest(problem, current, found, workers)
         out.append(found)
     return current, out
@@ -86,7 +91,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         e for e in alike(found, winner) if other(e.hypothesis) and all(e.hypothesis is not x.hypothesis for x in rivals)
     ]
     rivals += [*as_load(current, own, others), *elsewhere(problem, current, own, others)]
-    rivals += wider(problem, current, own) if nearly_settled(problem, current, winner) else []
+    rivals += wider(problem, current, own)
 
     enough = to_compete(current.cost, current.count)
 
@@ -194,19 +199,27 @@ def elsewhere(problem: Problem, current: Fit, own: Effect, others: Sequence[Effe
 
 
 def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
-    """Laws of the catalogue that hold an effect as a special case, at several shapes: a linear step may not lead
-    there."""
-    h = effect.hypothesis
-    there = {e.hypothesis.key for e in current.model.effects}
-    laws = [
-        x
-        for x in catalogue(problem.structure, motions_alone=problem.motions_alone)
-        if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options and x.key not in there
-    ]
+    """Laws that may hold an effect as a special case, at several shapes: a linear step may not lead there."""
+    laws = wider_laws(problem, current, effect.hypothesis)
     if not laws:
         return []
-    scale = signal_scale(problem, predictions(problem, current.model, current.remainders), h.joint, ())
+    preds = predictions(problem, current.model, current.remainders)
+    scale = signal_scale(problem, preds, effect.hypothesis.joint, ())
     return [Effect(x, clip_to_bounds(x, p)) for x in laws for p in x.options["widens"](effect.p, scale)]
+
+
+def wider_laws(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:
+    """Laws that hold another as a special case, where its shape can be what is missing: of a lag wherever its joint
+    has more than noise left, which no other joint answers for."""
+    alone, others = problem.motions_alone, {e.hypothesis.key for e in current.model.effects} - {h.key}
+    laws = second_order(h) if not alone and h.joint >= 0 and unsettled_at(current, h.joint) else []
+    if nearly_settled(problem, current, h):
+        laws += [
+            x
+            for x in catalogue(problem.structure, motions_alone=alone)
+            if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options
+        ]
+    return [x for x in laws if x.key not in others]
 
 
 def nearly_settled(problem: Problem, current: Fit, h: Hypothesis) -> bool:

@@ -102,6 +102,13 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
     return tuple(out)
 
 
+def second_order(hypothesis: Hypothesis) -> list[Hypothesis]:
+    """The lag of second order that holds a delay or a lag of first order; none of others."""
+    h = hypothesis
+    lags = [make(h.joint, h.place, second=True) for make in (drive.torque_lag, sensing.sensor_lag)]
+    return [x for x in lags if h.effect in (x.effect, x.options["holds"]) and "holds" not in h.options]
+
+
 def _turned(axes: np.ndarray) -> list[tuple[tuple[float, float, float], ...]]:
     """Each of the axes first, the others behind it."""
     rows = [(float(x), float(y), float(z)) for x, y, z in axes]
@@ -125,4 +132,4 @@ def _across(chain: Structure, joint: int) -> np.ndarray:
     return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-__all__ = ["Hypothesis", "Parameter", "Screen", "SignalScale", "catalogue"]
+__all__ = ["Hypothesis", "Parameter", "Screen", "SignalScale", "catalogue", "second_order"]

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.hypotheses.filters import STEPPED, lag
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale, sought
+from ident.hypotheses.filters import form
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from ident.hypotheses.ripple import SECOND, ripple
 from ident.inverse import recorded_share
 from ident.motion import Motion, Recorded
@@ -57,34 +57,33 @@ def torque_constant(joint: int, place: str) -> Hypothesis:
     )
 
 
-def torque_lag(joint: int, place: str, stepped: bool = True) -> Hypothesis:
-    """Current loop as a first-order lag: ``delivered = recorded / (1 + s time_constant)``.
+def torque_lag(joint: int, place: str, stepped: bool = True, second: bool = False) -> Hypothesis:
+    """Current loop as a lag: ``delivered = recorded / (1 + s time_constant)``, or of second order.
 
     Args:
-        stepped: whether it may come by a share of the time constant later or sooner, as one that is stepped in time
-            does by half of a step. Motions below the modes of the links do not show it.
+        stepped, second: as of ``filters.form``.
     """
+    own, late, options = form("torque_delay", stepped, second)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         return Screen(
             (1j * motion.group.omega * motion.solution.U[..., j],),
-            lambda c: np.array([c[0], *none]) if c[0] > 0 else None,
+            lambda c: np.array([c[0], *(0.0 for _ in own)]) if c[0] > 0 else None,
         )
 
-    step, none = sought(STEPPED, stepped)
     return Hypothesis(
         "torque_lag",
         place,
         joint,
         "drive",
-        (Parameter("time_constant", "s", 1e-7, 1.0, log=True), *step),
-        lambda p, motion, j, k, U: U * lag(p, 1j * motion.group.omega),
+        (Parameter("time_constant", "s", 1e-7, 1.0, log=True), *own),
+        lambda p, motion, j, k, U: U * late(p, 1j * motion.group.omega),
         lambda scale: [()],
         screen,
-        "The torque of {joint} follows its record as a first-order lag of {time_constant:.3g} s: phase is lost"
-        " and gain falls with frequency.",
+        "The torque of {joint} follows its record as a lag of {time_constant:.3g} s: phase is lost and gain falls with"
+        " frequency.",
         variable="torque",
-        options={"filter": lag},
+        options=options,
     )
 
 

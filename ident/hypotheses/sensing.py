@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ident.hypotheses.drive import SCALE, scale_of
-from ident.hypotheses.filters import STEPPED, lag
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, sought
+from ident.hypotheses.filters import form
+from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
 from ident.motion import Motion
 
 TRUE_STEPS = 4  # from a measured position to the one at which its error is that of the encoder
@@ -39,33 +39,33 @@ def sensor_delay(joint: int, place: str) -> Hypothesis:
     )
 
 
-def sensor_lag(joint: int, place: str, stepped: bool = True) -> Hypothesis:
-    """Measured position is filtered: the true one is ``(1 + s time_constant)`` times it.
+def sensor_lag(joint: int, place: str, stepped: bool = True, second: bool = False) -> Hypothesis:
+    """Measured position is filtered: the true one is ``(1 + s time_constant)`` times it, or that of second order.
 
     Args:
-        stepped: as of ``torque_lag``.
+        stepped, second: as of ``filters.form``.
     """
+    own, late, options = form("sensor_delay", stepped, second)
 
     def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
-        return (lag(p, 1j * motion.group.omega) - 1.0) * motion.solution.Q[..., j]
+        return (late(p, 1j * motion.group.omega) - 1.0) * motion.solution.Q[..., j]
 
-    step, none = sought(STEPPED, stepped)
     return Hypothesis(
         "sensor_lag",
         place,
         joint,
         "position",
-        (Parameter("time_constant", "s", 1e-7, 1.0, log=True), *step),
+        (Parameter("time_constant", "s", 1e-7, 1.0, log=True), *own),
         law,
         lambda scale: [()],
         lambda motion, j, k, shape: Screen(
             (1j * motion.group.omega * motion.solution.Q[..., j],),
-            lambda c: np.array([c[0], *none]) if c[0] > 0 else None,
+            lambda c: np.array([c[0], *(0.0 for _ in own)]) if c[0] > 0 else None,
         ),
         "The position of {joint} passes a filter of {time_constant:.3g} s: phase and gain of one row of the FRF"
         " fall with frequency.",
         variable="v",
-        options={"filter": lag},
+        options=options,
     )
 
 

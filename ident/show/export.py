@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -292,8 +292,16 @@ def _stepping(causes: Sequence[Cause], fastest: float) -> tuple[float, mujoco.mj
         if c.effect == "torque_delay":
             parts.append(1.5 * TIMESTEP / c.parameters["delay"].value)
         elif c.effect == "torque_lag":
-            parts.append(TIMESTEP / c.parameters["time_constant"].value)
+            lag, _ = lag_and_delay({name: value.value for name, value in c.parameters.items()})
+            parts.append(TIMESTEP / max(lag, TIMESTEP / MOST_REFINED))
     return TIMESTEP / min(int(np.ceil(max(parts))), MOST_REFINED), mujoco.mjtIntegrator.mjINT_RK4
+
+
+def lag_and_delay(p: Mapping[str, float]) -> tuple[float, float]:
+    """Time constant of a filter of first order and the delay beside it that a lag of second order is up to the second
+    power of frequency, s; below nought where it comes sooner."""
+    lag = p["time_constant"] * np.sqrt(max(1.0 - 2.0 * p.get("square", 0.0), 0.0))
+    return lag, p["time_constant"] * (1.0 + p.get("stepped", 0.0)) - lag
 
 
 def stage_lead(timestep: float, integrator: int) -> float:
@@ -353,10 +361,13 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         lead = 0.0 if drive.delay else stage_lead(step, spec.option.integrator)
         _add_delay(drive, p["delay"] + lead, step)
     elif cause.effect == "torque_lag":
-        exact = spec.option.integrator != mujoco.mjtIntegrator.mjINT_RK4
-        drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
-        late = p["time_constant"] * p.get("stepped", 0.0)
-        drive.dynprm = [p["time_constant"] + min(late, 0.0), *([0] * (len(drive.dynprm) - 1))]
+        lag, late = lag_and_delay(p)
+        if lag >= step:
+            exact = spec.option.integrator != mujoco.mjtIntegrator.mjINT_RK4
+            drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
+            drive.dynprm = [lag + min(late, 0.0), *([0] * (len(drive.dynprm) - 1))]
+        else:
+            late += lag
         if late > 0.0:
             _add_delay(drive, late, step)  # a filter integrates its input, whenever stages read it
     elif cause.effect == "torque_saturation":
