@@ -56,10 +56,19 @@ from ident.trust import (
     shadowed,
     shown,
     too_fast,
+    unlike_a_load,
     within_steps,
 )
 from ident.units import linear_names, unit_at
-from ident.values import baseline_values, extended_baseline, inertia_values, named_effects, reported_parameters
+from ident.values import (
+    baseline_values,
+    called,
+    extended_baseline,
+    inertia_values,
+    named_effects,
+    reported_parameters,
+    usual_swing,
+)
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
@@ -188,7 +197,8 @@ def named_causes(found: Findings, refuted: bool) -> Iterator[Cause]:
     for effect in named_effects(found.final):
         of_effect = rounds[effect.hypothesis.key]
         trust = trust_in(effect, of_effect, found, doubted, covariance)
-        cause = _cause(effect, of_effect.candidates, found.final, covariance, trust)
+        swing = usual_swing(found.last, effect.hypothesis.joint)
+        cause = _cause(effect, of_effect.candidates, found.final, covariance, trust, swing)
         yield from (cause, *_drifting_friction(cause))
 
 
@@ -215,6 +225,7 @@ def trust_in(effect: Effect, of_effect: Round, found: Findings, doubted: bool, c
         pointless(effect, found.final.model.par.stiffness[h.joint])
         or too_fast(problem, found.last, effect)
         or piece_of_a_curve(effect, found.final, found.last)
+        or unlike_a_load(effect, found.final)
         or within_steps(effect, found.setup.steps)
         or shadowed(of_effect, found.result.rounds)
         or h.key in found.belied
@@ -326,21 +337,35 @@ def _late(late: LinkDelay, joint: str) -> Cause:
     )
 
 
-def _cause(effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float) -> Cause:
+def _cause(
+    effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float, swing: float
+) -> Cause:
+    """What an effect is called, and what else could be in its place.
+
+    Args:
+        swing: of ``usual_swing`` at its joint.
+    """
     h = effect.hypothesis
     joints = h.options.get("joints", ())
-    same = [c for c in candidates if c.hypothesis.key == h.key and c.hypothesis.options.get("joints", ()) == joints]
+    name, others_called = called(effect, swing)
+
+    def name_of(c: Candidate) -> str:
+        tried = [e for e in c.fit.model.effects if e.hypothesis.key == c.hypothesis.key]
+        return "unknown" if c.hypothesis.decoy else called(tried[0], swing)[0] if tried else c.hypothesis.effect
+
+    places = [(name_of(c), c.hypothesis.place, c.hypothesis.options.get("joints", ())) for c in candidates]
+    same = [c for c, at in zip(candidates, places, strict=True) if at == (name, h.place, joints)]
     own = sum(c.probability for c in same) if candidates else 1.0
     others: dict[tuple[str, str], float] = {}
-    for c in candidates:
+    for c, (other, place, _) in zip(candidates, places, strict=True):
         if all(c is not x for x in same) and c.probability > 1e-3:
-            name = "unknown" if c.hypothesis.decoy else c.hypothesis.effect
-            others[(name, c.hypothesis.place)] = others.get((name, c.hypothesis.place), 0.0) + c.probability
+            others[(other, place)] = others.get((other, place), 0.0) + c.probability
     parameters = reported_parameters(effect, final, covariance)
     return Cause(
-        effect=h.effect,
+        effect=name,
         joint=h.place,
-        parameters=parameters,
+        parameters={others_called[k]: parameters[k] for k in others_called}
+        | {k: v for k, v in parameters.items() if k not in others_called},
         probability=float(np.clip(own * trust, 0.0, 0.999)),
         evidence=told(effect, final.model.structure, {k: v.value for k, v in parameters.items()}),
         alternatives=tuple(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ident.baseline import DETECTION_EXCESS, FAINT
 from ident.evidence import Candidate, errors_by_joint, weigh
-from ident.hypotheses import Hypothesis, catalogue, second_order
+from ident.hypotheses import Hypothesis, catalogue, wider_forms
 from ident.hypotheses.bodies import payload, payload_like
 from ident.hypotheses.hypothesis import RIPPLE
 from ident.model import Effect
@@ -209,10 +209,10 @@ def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
 
 
 def wider_laws(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:
-    """Laws that hold another as a special case, where its shape can be what is missing: of a lag wherever its joint
-    has more than noise left, which no other joint answers for."""
+    """Laws that hold another as a special case, where its shape can be what is missing: of drives and encoders
+    wherever their joint has more than noise left."""
     alone, others = problem.motions_alone, {e.hypothesis.key for e in current.model.effects} - {h.key}
-    laws = second_order(h) if not alone and h.joint >= 0 and unsettled_at(current, h.joint) else []
+    laws = wider_forms(h) if not alone and h.joint >= 0 and unsettled_at(current, h.joint) else []
     if nearly_settled(problem, current, h):
         laws += [
             x

@@ -79,6 +79,7 @@ def inner_torques(
             guess = old_link[..., c] - others
             noise = noise_of_motion(group, motion_per_position(structure, par, plane, j, gear=False))
             free = solution.Q_driven[..., j] + compliance * guess
+            free[:, 0] -= effect.hypothesis.options["rest"](effect.p)
             law = effect.hypothesis.options["loop"](effect.p)
             torque, steady[key] = _loop(law, grid, free, noise, compliance, modes, guess, near, alone)
             at_link[j] = others + torque

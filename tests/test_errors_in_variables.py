@@ -39,7 +39,7 @@ MOVED = [
     (ECCENTRIC,),
     (("unknown:position_scale", 1.1),),
     (("gravity_spring", 500.0, 0.3),),
-    (("dress_pack", 200.0, 1e-3, 1e-2, 0.0),),
+    (("dress_pack", 200.0, 1e-3, 1e-2, 0.0, 0.0),),
     (PAYLOAD, ECCENTRIC),
 ]
 

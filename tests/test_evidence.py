@@ -77,7 +77,16 @@ from ident.search import (
 from ident.seek import left_over
 from ident.strong import OTHER_MOTION, beside_strong, loudest_joint, matched, outdone_along, strong_effects
 from ident.torque_fit import RIDGE, fit, inverse
-from ident.trust import fails_held_out, left_on_held_out, patchwork, piece_of_a_curve, shadowed, shown
+from ident.trust import (
+    fails_held_out,
+    left_on_held_out,
+    patchwork,
+    piece_of_a_curve,
+    shadowed,
+    shown,
+    unlike_a_load,
+)
+from ident.values import usual_swing
 from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, JointGain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
@@ -1295,10 +1304,11 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
         given.append(cause.probability)
     assert given[0] > 0.9 and given[1] < 0.5
     monkeypatch.setattr("ident.conclude.shown", lambda *args: True)
-    with monkeypatch.context() as patched:
-        patched.setattr("ident.conclude.piece_of_a_curve", lambda *args: True)
-        (cause,) = conclude(Findings(data, setup, worse, heard, preds, preds)).causes
-        assert cause.probability < 0.5
+    for doubt in ("piece_of_a_curve", "unlike_a_load"):
+        with monkeypatch.context() as patched:
+            patched.setattr(f"ident.conclude.{doubt}", lambda *args: True)
+            (cause,) = conclude(Findings(data, setup, worse, heard, preds, preds)).causes
+            assert cause.probability < 0.5
     verdict = conclude(Findings(data, setup, worse, heard, preds, preds, belied={h.key}))
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
     assert any("hysteresis at elbow_joint" in note and "held out" in note for note in verdict.notes)
@@ -1672,19 +1682,53 @@ def test_the_cause_between_two_joints_names_both(identified, named):
     coupling = by_joints["wrist_1_joint", "wrist_2_joint"]
     coupled = replace(result.model, effects=(Effect(coupling, np.array([0.01])),))
     final = refit(setup.problem, coupled, result.weights, result.remainders, 1)
-    cause = _cause(final.model.effects[0], [], final, final.covariance(), 1.0)
+    cause = _cause(final.model.effects[0], [], final, final.covariance(), 1.0, swing=1e-2)
     # The same effect tried with two shapes, the same motor with another joint, and a rival.
     rival = candidate(named["torque_delay", "wrist_1_joint"], [1e-3], [1.0]).fit
     tried = [Candidate(final.model.effects[0].hypothesis, x, 0.0, p) for x, p in ((final, 0.6), (result, 0.1))]
     tried.append(Candidate(by_joints["wrist_1_joint", "wrist_3_joint"], final, 0.0, 0.1))
     tried.append(Candidate(named["torque_delay", "wrist_1_joint"], rival, 0.0, 0.2))
-    told = _cause(final.model.effects[0], tried, final, final.covariance(), 1.0)
+    told = _cause(final.model.effects[0], tried, final, final.covariance(), 1.0, swing=1e-2)
     assert told.probability == pytest.approx(0.7) and [a.effect for a in told.alternatives] == [
         "torque_delay",
         "joint_coupling",
     ]
     assert cause.joint == "wrist_1_joint" and cause.joints == ("wrist_1_joint", "wrist_2_joint")
     assert "wrist_1_joint turns wrist_2_joint too" in cause.evidence
+
+
+def test_a_bristle_that_slips_within_a_small_part_of_the_motion_goes_by_the_name_of_a_dry_friction(identified, named):
+    """Its stiffness is told all the same, and what a dry friction without has of the probability is its own."""
+    _, setup, result = identified
+    bristle, dry = (named[effect, "elbow_joint"] for effect in ("presliding_friction", "coulomb_friction"))
+    effect = Effect(bristle, np.array([1e5, 10.0, 1.0, 0.0]))
+    yielding = replace(result.model, effects=(effect,))
+    final = refit(setup.problem, yielding, result.weights, result.remainders, 1)
+    final = replace(final, model=yielding)
+    tried = [Candidate(bristle, final, 0.0, 0.9), candidate(dry, [10.0, 0.0, 1e-3, 0.0], np.ones(4))]
+    tried[1] = replace(tried[1], probability=0.08)
+    covariance = 1e-4 * np.eye(len(final.names))
+    at_once = _cause(effect, tried, final, covariance, 1.0, swing=0.03)
+    assert at_once.effect == "coulomb_friction" and at_once.probability == pytest.approx(0.98)
+    assert at_once.parameters["torque"].value == 10.0 and at_once.parameters["stiffness"].value == 1e5
+    yields = _cause(effect, tried, final, covariance, 1.0, swing=5e-3)
+    assert yields.effect == "presliding_friction" and yields.probability == pytest.approx(0.9)
+    assert "coulomb" in yields.parameters and [a.effect for a in yields.alternatives] == ["coulomb_friction"]
+
+
+@pytest.mark.parametrize(
+    ("mass", "inertia", "unlike"), [(0.009, 0.035, True), (0.009, 0.005, False), (5.0, 1.0, False)]
+)
+def test_a_load_that_reaches_further_than_an_arm_could_carry_one_is_none(identified, named, mass, inertia, unlike):
+    effect = Effect(named["payload", "flange"], np.array([mass, 0.0, 0.0, 0.1, 1e-4, inertia, inertia]))
+    assert unlike_a_load(effect, identified[2]) is unlike
+    assert not unlike_a_load(Effect(named["backlash", "elbow_joint"], np.array([1e-3, 0.1])), identified[2])
+
+
+def test_the_usual_swing_is_that_of_records_in_which_a_joint_moves():
+    turns = np.zeros((4, 3, 2), complex)
+    turns[:, 0, 0], turns[:, 1, 0] = 1.0, [1e-5, 0.01, 0.02, 0.05]  # a posture, and an amplitude of twice that
+    assert usual_swing([SimpleNamespace(group=SimpleNamespace(Q=turns))], 0) == pytest.approx(0.02 * np.sqrt(2.0))
 
 
 def test_a_cause_of_the_whole_arm_is_shown_at_one_joint():
@@ -1756,7 +1800,7 @@ def test_coulomb_friction_that_drifts_is_a_cause_of_its_own(size, std, told):
 def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named):
     _, setup, result = identified
     model = replace(
-        result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2, 0.0])),)
+        result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2, 0.0, 0.0])),)
     )
     fitted = refit(setup.problem, model, result.weights, result.remainders, 1)
     cable = Candidate(fitted.model.effects[-1].hypothesis, fitted, 0.0)

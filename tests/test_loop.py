@@ -239,3 +239,15 @@ def test_loops_go_on_from_the_steady_states_of_their_own_laws(identified, monkey
     own = {True: soft.key, False: cable.key}
     assert all(near is made[own[code == kernels.SOFTENING]] for code, near in begun[:2])
     assert np.abs(again.U - first.U).max() < 1e-5 * np.abs(first.U).max()
+
+
+def test_a_cable_that_hangs_elsewhere_is_a_spring_with_rest_there_where_it_does_not_rub(identified):
+    _, setup, result = identified
+    named = {h.key: h for h in reversed(catalogue(setup.problem.structure))}
+    spring, cable = named["gravity_spring", "elbow_joint"], named["dress_pack", "elbow_joint"]
+    smooth = {"stiffness": 20.0, "rest_angle": 0.4, "friction": 1e-9, "smoothing_velocity": 1e-2}
+    group, effects = setup.problem.groups[0], (spring, cable)
+    effects = [Effect(h, np.array([smooth.get(q.name, 0.0) for q in h.parameters])) for h in effects]
+    models = [result.model, *(replace(result.model, effects=(e,)) for e in effects)]
+    bare, first, other = (predict(m, group, setup.problem.sampling).U for m in models)
+    assert np.abs(other - first).max() < 1e-6 * np.abs(first - bare).max()

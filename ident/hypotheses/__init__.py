@@ -62,7 +62,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
         out.append(
             transmission.backlash(j, name, max(robot.joints[j].damping / robot.joints[j].stiffness, LEAST_DAMPING))
         )
-        out.append(link_springs.dress_pack(j, name, yields=True))
+        out.append(link_springs.dress_pack(j, name, not motions_alone, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.rising_friction(j, name))
         out.append(friction.position_friction(j, name, not motions_alone))
@@ -102,11 +102,16 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
     return tuple(out)
 
 
-def second_order(hypothesis: Hypothesis) -> list[Hypothesis]:
-    """The lag of second order that holds a delay or a lag of first order; none of others."""
+def wider_forms(hypothesis: Hypothesis) -> list[Hypothesis]:
+    """Forms of a law of an encoder or of a drive that hold it and have the same name, or that of a law next to it: of a
+    lag or a delay the lag of second order, of an encoder out of centre the one that is oval too. None of others."""
     h = hypothesis
+    if "holds" in h.options:
+        return []
+    if h.effect == "encoder_eccentricity":
+        return [sensing.encoder_eccentricity(h.joint, h.place, h.options["turns"], oval=True)]
     lags = [make(h.joint, h.place, second=True) for make in (drive.torque_lag, sensing.sensor_lag)]
-    return [x for x in lags if h.effect in (x.effect, x.options["holds"]) and "holds" not in h.options]
+    return [x for x in lags if h.effect in (x.effect, x.options["holds"])]
 
 
 def _turned(axes: np.ndarray) -> list[tuple[tuple[float, float, float], ...]]:
@@ -132,4 +137,4 @@ def _across(chain: Structure, joint: int) -> np.ndarray:
     return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-__all__ = ["Hypothesis", "Parameter", "Screen", "SignalScale", "catalogue", "second_order"]
+__all__ = ["Hypothesis", "Parameter", "Screen", "SignalScale", "catalogue", "wider_forms"]

@@ -11,6 +11,8 @@ from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
 
 FARTHEST_REST = 10.0  # of a balancing spring, rad or m
+# of a bundle of cables; where all that moves is one motion its baseline has a constant torque
+REST = Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, nuisance=True, step=1e-3, spread=0.3, null=0.0)
 YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
 
 
@@ -46,15 +48,19 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
     )
 
 
-def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False) -> Hypothesis:
-    """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``.
+def dress_pack(joint: int, place: str, repeats: bool = True, yields: bool = False) -> Hypothesis:
+    """Cable bundle on the link side: ``stiffness (q_link - rest_angle) + friction sign(q_link')``.
 
     Args:
-        leads: whether it may turn before the velocity does (see ``friction``).
+        repeats: whether it is sought in periodic records: it may turn before the velocity does there (see
+            ``friction``), and hang about another angle than zero.
         yields: whether the friction turns over with the path, as of cables that give before they slip (Dahl 1968), in
             place of the velocity.
     """
-    lead, _ = sought(LEAD, leads)
+    lead, _ = sought(LEAD, repeats and not yields)
+    rest, _ = sought(REST, repeats)
+    turn_or_give = (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START)
+    own = (*(turn_or_give if yields else (SMOOTHING, *lead)), *rest)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v, q = ahead(motion.v_link(j), motion.time_step, sum(shape)), motion.q_link(j)
@@ -62,18 +68,21 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False)
         give = YIELDS * float(np.std(q))
 
         def start(c):
-            own = (give, 0.0) if yields else (turn, *shape)
-            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *own]) if max(c[0], c[1]) > 0 else None
+            if not max(c[0], c[1]) > 0:
+                return None
+            hangs = [float(np.clip(-x / max(c[0], 1e-3), -1.0, 1.0)) for x in c[2:]]
+            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *((give, 0.0) if yields else (turn, *shape)), *hangs])
 
-        if not yields:
-            return Screen((q, direction(v, turn)), start, shape)
-        return Screen((q, elastoplastic(q, 1.0 / max(give, 1e-12), 1.0, begins=motion.group.window is not None)), start)
+        rubs = (
+            elastoplastic(q, 1.0 / max(give, 1e-12), 1.0, begins=motion.group.window is not None)
+            if yields
+            else direction(v, turn)
+        )
+        return Screen((q, rubs, *(np.ones_like(q) for _ in rest)), start, shape)
 
-    own = (
-        (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START)
-        if yields
-        else (SMOOTHING, *lead)
-    )
+    def rest_of(p) -> float:
+        return float(p[-1]) if rest else 0.0
+
     return Hypothesis(
         "dress_pack",
         place,
@@ -85,7 +94,7 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False)
             *own,
         ),
         no_law,
-        lambda scale: [(x,) for x in SOFT] if lead and not yields else [()],
+        lambda scale: [(x,) for x in SOFT] if lead else [()],
         screen,
         "A bundle of {stiffness:.3g} N m/rad with {friction:.3g} N m of friction pulls on the link of {joint}.",
         variable="q",
@@ -93,14 +102,15 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False)
             "loop": lambda p: (
                 kernels.Law(kernels.CABLE, p[0], p[1], p[1] / p[2], start=p[3])
                 if yields
-                else kernels.Law(kernels.LINK, p[0], p[1], p[2], lead=sum(p[3:]))
+                else kernels.Law(kernels.LINK, p[0], p[1], p[2], lead=float(p[3]) if lead else 0.0)
             ),
+            "rest": rest_of,
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the
             # motor.
             "trivial": lambda p, k: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
-            "absorb": lambda p, weights, old: np.array([old[0], *p[1:]]),
+            "absorb": lambda p, weights, old: np.array([old[0], *p[1 : len(p) - len(rest)], *(old[1] for _ in rest)]),
             "apart": "friction",
-            "special": lambda p: np.array([p[0], 0.0]),
+            "special": lambda p: np.array([p[0], rest_of(p)]),
         },
     )

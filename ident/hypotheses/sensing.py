@@ -9,6 +9,7 @@ import numpy as np
 from ident.hypotheses.drive import SCALE, scale_of
 from ident.hypotheses.filters import form
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen
+from ident.hypotheses.ripple import SECOND, ripple
 from ident.motion import Motion
 
 TRUE_STEPS = 4  # from a measured position to the one at which its error is that of the encoder
@@ -69,37 +70,45 @@ def sensor_lag(joint: int, place: str, stepped: bool = True, second: bool = Fals
     )
 
 
-def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothesis:
+def encoder_eccentricity(joint: int, place: str, turns: float = 1.0, oval: bool = False) -> Hypothesis:
     """Measured position holds ``amplitude sin(turns q + phase)`` of the true one ``q``, which is that much less.
 
     Args:
         turns: of the encoder in a turn of the joint: the gear ratio where it sits at the motor.
+        oval: whether its error has a second harmonic, as of a disc that is no circle. Fitted where the first leaves
+            more than noise.
     """
 
     def wave(p) -> tuple[float, float]:
         """Amplitude and phase: a sine a sample is half the work of two."""
         return float(np.hypot(p[0], p[1])), float(np.arctan2(p[1], p[0]))
 
-    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+    def error_at(p, angle: np.ndarray) -> np.ndarray:
+        if oval:
+            return ripple(p[0], p[1], p[2:], angle)[0]
         amplitude, phase = wave(p)
-        angle = turns * motion.q(j) + phase
-        error = amplitude * np.sin(angle)
+        return amplitude * np.sin(angle + phase)
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        angle = turns * motion.q(j)
+        error = error_at(p, angle)
         for _ in range(TRUE_STEPS - 1):
-            error = amplitude * np.sin(angle - turns * error)
+            error = error_at(p, angle - turns * error)
         return -motion.lines(error)
 
     def slope(p, q: np.ndarray) -> np.ndarray:
-        amplitude, phase = wave(p)
-        return 1.0 / (1.0 + turns * amplitude * np.cos(turns * q + phase))
+        return 1.0 / (1.0 + turns * ripple(p[0], p[1], p[2:], turns * q)[1])
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q, unseen = turns * motion.q(j), turns * motion.unseen(j)
         sine, cosine = np.sin(q), np.cos(q)
         return Screen(
             (-motion.lines(sine) - np.mean(cosine) * unseen, -motion.lines(cosine) + np.mean(sine) * unseen),
-            lambda c: np.array(c),
+            lambda c: np.array([*c, *(0.0 for _ in second)]),
         )
 
+    second = SECOND if oval else ()
+    wide = {"holds": "encoder_eccentricity", "widens": lambda p, scale: [np.array([*p[:2], 0.0, 0.0])]}
     return Hypothesis(
         "encoder_eccentricity",
         place,
@@ -108,6 +117,7 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         (
             Parameter("sine", "rad", -0.2, 0.2, step=1e-6),
             Parameter("cosine", "rad", -0.2, 0.2, step=1e-6),
+            *second,
         ),
         law,
         lambda scale: [()],
@@ -115,7 +125,7 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0) -> Hypothes
         "The encoder of {joint} errs by {amplitude:.3g} rad once a turn of "
         + ("its motor." if turns != 1.0 else "the joint."),
         variable="q",
-        options={"slope": slope},
+        options={"slope": slope, "turns": turns} | (wide if oval else {}),
     )
 
 
