@@ -29,9 +29,9 @@ STEP = 1e-5
 
 def with_effects(model, *named):
     """A model with effects, each by its name and parameters: of the catalogue at the elbow, and a payload."""
-    places = "elbow_joint", "flange"
-    of = {h.effect: h for h in reversed(catalogue(model.structure)) if h.place in places}  # encoders at the joint
-    return replace(model, effects=tuple(Effect(of[name], np.array(p)) for name, *p in named))
+    laws = [h for h in catalogue(model.structure) if h.place in ("elbow_joint", "flange")]
+    of = {(h.effect, len(h.parameters)): h for h in reversed(laws)}  # encoders at the joint
+    return replace(model, effects=tuple(Effect(of[name, len(p)], np.array(p)) for name, *p in named))
 
 
 ECCENTRIC, PAYLOAD = ("encoder_eccentricity", 0.1, 0.05), ("payload", 2.0, 0.02, 0.0, 0.05, 0.01, 0.01, 0.01)
@@ -39,6 +39,7 @@ MOVED = [
     (ECCENTRIC,),
     (("unknown:position_scale", 1.1),),
     (("gravity_spring", 500.0, 0.3),),
+    (("gravity_spring", 500.0, 0.3, -1.0, 2.0),),
     (("dress_pack", 200.0, 1e-3, 1e-2, 0.0, 0.0),),
     (PAYLOAD, ECCENTRIC),
 ]

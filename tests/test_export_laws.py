@@ -1,11 +1,14 @@
 """Elements of the exported model against the laws that they stand for."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ident.hypotheses.link_springs import spring_between_points
 from ident.hypotheses.yielding import along_path, bristle, elastoplastic
 from ident.show.dips import square_dips
 from ident.show.export import build_mjcf
@@ -197,3 +200,21 @@ def test_a_delayed_encoder_shows_an_earlier_position(bench):
     shown, true, time = map(np.array, (shown, true, time))
     late = time > 0.01
     assert np.allclose(shown[late], np.interp(time[late] - 1.1e-3, time, true), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("share", "stretch"), [(-1.5, 0.83), (0.0, 3.0), (0.7, 2.0)])
+@pytest.mark.parametrize(("arm", "joint"), [("twomass", JOINT), ("ur10", "elbow_joint"), ("ur10", "wrist_2_joint")])
+def test_a_spring_between_two_points_pulls_as_its_law(arm, joint, share, stretch):
+    """A slack one, one without a length of its own, and one that is nearly a gas spring."""
+    p = {"stiffness": 4.0, "rest_angle": 0.4, "constant_share": share, "stretch": stretch}
+    model, data = exported(load_robot(arm), cause("gravity_spring", joint, **p))
+    at = model.joint(f"link:{joint}")
+    q = np.linspace(-1.5, 2.0, 15)
+    out = []
+    for x in q:
+        data.qpos[at.qposadr], data.qpos[model.joint(f"motor:{joint}").qposadr] = x, x
+        mujoco.mj_forward(model, data)
+        out.append(data.qfrc_passive[at.dofadr[0]])
+    moving = SimpleNamespace(q_link=lambda j: q)
+    law = spring_between_points(0, joint).law(np.array(list(p.values())), moving, 0, 1.0)
+    assert -np.array(out) == pytest.approx(law, rel=1e-5, abs=1e-5)

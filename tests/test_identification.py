@@ -231,7 +231,7 @@ def test_links_behind_gears_are_found_beside_elastic_hinges(tmp_path):
             assert motion.q_link(j) == pytest.approx(motion.q(j) - motion.delta(j), abs=1e-4)
     best = screen(problem, result, preds, [h for h in catalogue(problem.structure) if h.effect == "gravity_spring"])[0]
     assert best.hypothesis.place == "joint_2"
-    assert best.start == pytest.approx([900.0, 0.2], rel=0.1)
+    assert best.start[:2] == pytest.approx([900.0, 0.2], rel=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -243,8 +243,9 @@ def test_loops_go_on_from_the_steady_states_of_their_own_laws(identified, monkey
 
 def test_a_cable_that_hangs_elsewhere_is_a_spring_with_rest_there_where_it_does_not_rub(identified):
     _, setup, result = identified
-    named = {h.key: h for h in reversed(catalogue(setup.problem.structure))}
-    spring, cable = named["gravity_spring", "elbow_joint"], named["dress_pack", "elbow_joint"]
+    at_elbow = [h for h in catalogue(setup.problem.structure) if h.place == "elbow_joint"]
+    spring = [h for h in at_elbow if h.effect == "gravity_spring"][-1]
+    cable = next(h for h in at_elbow if h.effect == "dress_pack")
     smooth = {"stiffness": 20.0, "rest_angle": 0.4, "friction": 1e-9, "smoothing_velocity": 1e-2}
     group, effects = setup.problem.groups[0], (spring, cable)
     effects = [Effect(h, np.array([smooth.get(q.name, 0.0) for q in h.parameters])) for h in effects]

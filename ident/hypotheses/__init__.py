@@ -54,6 +54,8 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
         out.append(drive.torque_saturation(j, name, wound_up=True))
         if not motions_alone:
             out.append(friction.bristled_stribeck(j, name))
+        if not linear[j]:  # before the plain one, which has its name
+            out.append(link_springs.spring_between_points(j, name))
         out += [make(j, name, not motions_alone) for make in SHARPER]
         out += [make(j, name) for make in PER_JOINT]
         out.append(friction.presliding_friction(j, name, damped=not motions_alone))

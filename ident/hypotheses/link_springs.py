@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ident.hypotheses import kernels
@@ -11,6 +13,10 @@ from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
 
 FARTHEST_REST = 10.0  # of a balancing spring, rad or m
+# of a spring between two points: torque of a force that does not grow with its length, over all of it, about rest; and
+# what its length grows by in half a turn, 2 a b / (a - b)^2 of the distances of its points from the axis
+CONSTANT = Parameter("constant_share", "1", -4.0, 1.0, nuisance=True, step=1e-2, center=0.0, spread=1.0, reported=True)
+STRETCH = Parameter("stretch", "1", 1e-2, 1e2, True, nuisance=True, step=1e-2, center=1.0, spread=1.5, reported=True)
 # of a bundle of cables; where all that moves is one motion its baseline has a constant torque
 REST = Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, nuisance=True, step=1e-3, spread=0.3, null=0.0)
 YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
@@ -45,6 +51,42 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
             "trivial": lambda p, k: abs(p[1]) > 0.95 * FARTHEST_REST,  # a constant torque
             "slope": lambda p, q: p[0],
         },
+    )
+
+
+def spring_between_points(joint: int, place: str) -> Hypothesis:
+    """Balancing spring between two points, one on either side of the joint: of ``stiffness`` about its rest.
+
+    At the angle ``x`` from there its torque is ``stiffness sin x (1 - c + c / sqrt(u))``, ``u = 1 + stretch (1 - cos
+    x)``: a spring without a length of its own has no ``c``, a gas spring that pushes alike at any length one of 1, a
+    spring that is slack at a length one below nought.
+    """
+
+    def law(p, motion: Motion, j: int, k: float) -> np.ndarray:
+        x = motion.q_link(j) - p[1]
+        return p[0] * np.sin(x) * (1.0 + p[2] * ((1.0 + p[3] * (1.0 - np.cos(x))) ** -0.5 - 1.0))
+
+    def slope(p, q: np.ndarray) -> np.ndarray:
+        x = q - p[1]
+        u = 1.0 + p[3] * (1.0 - np.cos(x))
+        bent = 0.5 * p[2] * p[3] * np.sin(x) ** 2 * u**-1.5
+        return p[0] * (np.cos(x) * (1.0 + p[2] * (u**-0.5 - 1.0)) - bent)
+
+    def screen(motion: Motion, j: int, k: float, shape) -> Screen:
+        q = motion.q_link(j)
+        return Screen(
+            (np.sin(q), np.cos(q)),
+            lambda c: np.array([np.hypot(*c), np.arctan2(-c[1], c[0]), CONSTANT.center, STRETCH.center]),
+        )
+
+    plain = gravity_spring(joint, place)
+    stiffness, rest = plain.parameters
+    return replace(
+        plain,
+        parameters=(stiffness, replace(rest, lower=-2.0 * np.pi, upper=2.0 * np.pi), CONSTANT, STRETCH),
+        law=law,
+        screen=screen,
+        options={"slope": slope},
     )
 
 

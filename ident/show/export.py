@@ -28,6 +28,7 @@ NO_INPUT = int(mujoco.mjtCtrlInput.mjINPUT_NONE)
 MOST_ROUNDED = 2.0  # exponent of a presliding friction below which it is the bristle that MuJoCo has
 FRICTION_SLIP = "friction"  # begins the names of springs that stand for the friction of a motor
 PASSIVE_GROUP = 1  # of actuators without input
+MOST_CONSTANT = 0.99  # share of a force of a spring that does not grow with its length
 TORQUE_OFFSET = "torque_offset"
 FLAT = 1e-5  # of the largest moment of inertia, by which the others are more together
 ROTOR_MASS = 1e-3  # kg, of a sphere of 50 mm: a body must have a mass; its inertia is taken off the armature
@@ -242,7 +243,7 @@ NATIVE = {
     "softening_stiffness": "gear:{place} and, with a dead band, outer:{place}",
     "backlash": "springlength of gear:{place}",
     "hysteresis": "springs slip:{index}, which yield",
-    "gravity_spring": "spring of link:{place}",
+    "gravity_spring": "spring of link:{place}, or the tendon spring:{index} between two points",
     "dress_pack": "spring and frictionloss of link:{place}",
     "joint_coupling": "motor:{place} in the gear of the joint that it turns too",
     "payload": "inertia of the last body",
@@ -385,7 +386,10 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         slips = maxwell_slips(p["stiffness"], p["yield_torque"], p.get("exponent", SLIP), p.get("recoil", 0.0))
         _add_slips(spec, f"slip:{index}", slips, {f"motor:{name}": 1.0, f"link:{name}": -1.0})
     elif cause.effect in ("gravity_spring", "dress_pack"):
-        _add_spring(link, p["stiffness"], p.get("rest_angle", 0.0))
+        if "stretch" in p:
+            _add_spring_between_points(spec, f"spring:{index}", link, p)
+        else:
+            _add_spring(link, p["stiffness"], p.get("rest_angle", 0.0))
         if p.get("friction", 0.0) > 0:
             _add_friction(link, p["friction"], step, p.get("lead", 0.0))
     elif cause.effect == "sensor_delay":
@@ -426,6 +430,41 @@ def _add_parallel(spec: mujoco.MjSpec, name: str, joint: str, stiffness: float, 
     spring.wrap_joint(f"link:{joint}", -1.0)
     spring.stiffness, spring.springlength = [stiffness, 0, 0], [-free, free]
     return spring
+
+
+def _add_spring_between_points(spec: mujoco.MjSpec, name: str, joint: mujoco.MjsJoint, p: Mapping[str, float]) -> None:
+    """A tendon from a point of the link to one before its joint, as ``link_springs.spring_between_points`` describes.
+
+    Their distances from the axis are chosen: the torque says their ratio alone. A force that does not grow with the
+    length is that of a spring which is slack there, or of a further part of the tendon that does not move.
+    """
+    far, share = 1.0, min(p["constant_share"], MOST_CONSTANT)
+    near = _nearer(p["stretch"]) * far
+    ratio = p["stiffness"] / (near * far)
+    axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    body = joint.parent
+    placed = pin.SE3(pin.Quaternion(*body.quat).matrix(), np.asarray(body.pos))
+    at_rest = pin.AngleAxis(p["rest_angle"], axis).matrix() @ across
+    body.add_site(name=f"{name}.link", pos=near * across)
+    before = placed.act(far * at_rest)
+    body.parent.add_site(name=f"{name}.before", pos=before)
+    spring = spec.add_tendon(name=name, rgba=[0, 0, 0, 0])
+    force_over_stiffness = share * (far - near) / (1.0 - share)
+    if share > 0.0:
+        body.parent.add_site(name=f"{name}.end", pos=before + placed.rotation @ (force_over_stiffness * axis))
+        spring.wrap_site(f"{name}.end")
+    spring.wrap_site(f"{name}.before")
+    spring.wrap_site(f"{name}.link")
+    spring.stiffness = [ratio * (1.0 - share), 0, 0]
+    spring.springlength = [max(-force_over_stiffness, 0.0)] * 2
+
+
+def _nearer(stretch: float) -> float:
+    """Smaller over larger distance ``r`` of two points from an axis, of a ``stretch`` of ``2 r / (1 - r)^2``."""
+    half = 1.0 + 1.0 / stretch
+    return float(half - np.sqrt(half**2 - 1.0))
 
 
 def _add_slips(spec: mujoco.MjSpec, name: str, slips: Sequence[tuple[float, float]], along: dict[str, float]) -> None:
