@@ -40,7 +40,7 @@ MOVED = [
     (("unknown:position_scale", 1.1),),
     (("gravity_spring", 500.0, 0.3),),
     (("gravity_spring", 500.0, 0.3, -1.0, 2.0),),
-    (("dress_pack", 200.0, 1e-3, 1e-2, 0.0, 0.0),),
+    (("dress_pack", 200.0, 1e-3, 1e-2, 0.0),),
     (PAYLOAD, ECCENTRIC),
 ]
 

@@ -1800,7 +1800,7 @@ def test_coulomb_friction_that_drifts_is_a_cause_of_its_own(size, std, told):
 def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named):
     _, setup, result = identified
     model = replace(
-        result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2, 0.0, 0.0])),)
+        result.model, effects=(Effect(named["dress_pack", "elbow_joint"], np.array([50.0, 1e-8, 1e-2, 0.0])),)
     )
     fitted = refit(setup.problem, model, result.weights, result.remainders, 1)
     cable = Candidate(fitted.model.effects[-1].hypothesis, fitted, 0.0)

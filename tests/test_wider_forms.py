@@ -22,7 +22,7 @@ def test_one_of_second_order_holds_one_of_first_and_two_in_a_row():
     assert np.allclose(second_order_lag([1e-3, 0.5], slow), np.exp(1e-3 * slow), atol=2e-3)
 
 
-def test_it_is_asked_for_where_a_lag_or_a_delay_stands(locked, tmp_path):
+def test_wider_forms_are_asked_for_where_the_plain_ones_stand(locked, tmp_path):
     setup, _ = identify(through_files(quick_experiment(small_plan(locked, 3), seed=3), tmp_path))
     asked = {h.effect: [x.effect for x in wider_forms(h)] for h in catalogue(setup.problem.structure)}
     assert {k: v for k, v in asked.items() if v} == {
@@ -31,6 +31,8 @@ def test_it_is_asked_for_where_a_lag_or_a_delay_stands(locked, tmp_path):
         "sensor_delay": ["sensor_lag"],
         "sensor_lag": ["sensor_lag"],
         "encoder_eccentricity": ["encoder_eccentricity"],
+        "gravity_spring": ["dress_pack"],
+        "dress_pack": ["dress_pack"],
     }
     wide = wider_forms(next(h for h in catalogue(setup.problem.structure) if h.effect == "torque_delay"))[0]
     assert wider_forms(wide) == []

@@ -64,7 +64,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
         out.append(
             transmission.backlash(j, name, max(robot.joints[j].damping / robot.joints[j].stiffness, LEAST_DAMPING))
         )
-        out.append(link_springs.dress_pack(j, name, not motions_alone, yields=True))
+        out.append(link_springs.dress_pack(j, name, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
         out.append(friction.rising_friction(j, name))
         out.append(friction.position_friction(j, name, not motions_alone))
@@ -106,12 +106,15 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
 
 def wider_forms(hypothesis: Hypothesis) -> list[Hypothesis]:
     """Forms of a law of an encoder or of a drive that hold it and have the same name, or that of a law next to it: of a
-    lag or a delay the lag of second order, of an encoder out of centre the one that is oval too. None of others."""
+    lag or a delay the lag of second order, of an encoder out of centre the one that is oval too, of a balancing spring
+    or a bundle of cables the bundle with another rest. None of others."""
     h = hypothesis
     if "holds" in h.options:
         return []
     if h.effect == "encoder_eccentricity":
         return [sensing.encoder_eccentricity(h.joint, h.place, h.options["turns"], oval=True)]
+    if h.effect in ("gravity_spring", "dress_pack"):
+        return [link_springs.hung_dress_pack(h.joint, h.place, h.effect == "gravity_spring")]
     lags = [make(h.joint, h.place, second=True) for make in (drive.torque_lag, sensing.sensor_lag)]
     return [x for x in lags if h.effect in (x.effect, x.options["holds"])]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ident.hypotheses import kernels
 from ident.hypotheses.friction import LEAD, SMOOTHING, SOFT, ahead, direction
-from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen, no_law, sought
+from ident.hypotheses.hypothesis import START, Hypothesis, Parameter, Screen, SignalScale, no_law, sought
 from ident.hypotheses.yielding import elastoplastic
 from ident.motion import Motion
 
@@ -17,7 +17,8 @@ FARTHEST_REST = 10.0  # of a balancing spring, rad or m
 # what its length grows by in half a turn, 2 a b / (a - b)^2 of the distances of its points from the axis
 CONSTANT = Parameter("constant_share", "1", -4.0, 1.0, nuisance=True, step=1e-2, center=0.0, spread=1.0, reported=True)
 STRETCH = Parameter("stretch", "1", 1e-2, 1e2, True, nuisance=True, step=1e-2, center=1.0, spread=1.5, reported=True)
-# of a bundle of cables; where all that moves is one motion its baseline has a constant torque
+TURNS = 0.02  # of the rms velocity, within which the friction of a cable turns, to begin with
+RUBS = 0.1, 1.0  # friction of a cable, over the torque of its spring in the rms motion, to begin with
 REST = Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, nuisance=True, step=1e-3, spread=0.3, null=0.0)
 YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
 
@@ -90,37 +91,34 @@ def spring_between_points(joint: int, place: str) -> Hypothesis:
     )
 
 
-def dress_pack(joint: int, place: str, repeats: bool = True, yields: bool = False) -> Hypothesis:
-    """Cable bundle on the link side: ``stiffness (q_link - rest_angle) + friction sign(q_link')``.
+def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False, hung: bool = False) -> Hypothesis:
+    """Cable bundle on the link side: ``stiffness q_link + friction sign(q_link')``.
 
     Args:
-        repeats: whether it is sought in periodic records: it may turn before the velocity does there (see
-            ``friction``), and hang about another angle than zero.
+        leads: whether it may turn before the velocity does (see ``friction``).
         yields: whether the friction turns over with the path, as of cables that give before they slip (Dahl 1968), in
             place of the velocity.
+        hung: whether its spring is at rest at another angle than zero. Fitted where a balancing spring, or a bundle
+            that is not, leaves more than noise.
     """
-    lead, _ = sought(LEAD, repeats and not yields)
-    rest, _ = sought(REST, repeats)
+    lead, _ = sought(LEAD, leads and not yields)
+    rest, _ = sought(REST, hung)
     turn_or_give = (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START)
     own = (*(turn_or_give if yields else (SMOOTHING, *lead)), *rest)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v, q = ahead(motion.v_link(j), motion.time_step, sum(shape)), motion.q_link(j)
-        turn = 0.02 * float(np.sqrt(np.mean(v**2)))
+        turn = TURNS * float(np.sqrt(np.mean(v**2)))
         give = YIELDS * float(np.std(q))
 
         def start(c):
-            if not max(c[0], c[1]) > 0:
-                return None
-            hangs = [float(np.clip(-x / max(c[0], 1e-3), -1.0, 1.0)) for x in c[2:]]
-            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *((give, 0.0) if yields else (turn, *shape)), *hangs])
+            turns = (give, 0.0) if yields else (turn, *shape)
+            hangs = (0.0 for _ in rest)
+            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *turns, *hangs]) if max(c[0], c[1]) > 0 else None
 
-        rubs = (
-            elastoplastic(q, 1.0 / max(give, 1e-12), 1.0, begins=motion.group.window is not None)
-            if yields
-            else direction(v, turn)
-        )
-        return Screen((q, rubs, *(np.ones_like(q) for _ in rest)), start, shape)
+        if not yields:
+            return Screen((q, direction(v, turn)), start, shape)
+        return Screen((q, elastoplastic(q, 1.0 / max(give, 1e-12), 1.0, begins=motion.group.window is not None)), start)
 
     def rest_of(p) -> float:
         return float(p[-1]) if rest else 0.0
@@ -151,8 +149,25 @@ def dress_pack(joint: int, place: str, repeats: bool = True, yields: bool = Fals
             # motor.
             "trivial": lambda p, k: p[0] < 0.2 * p[1],
             "absorbs": "gravity_spring",
-            "absorb": lambda p, weights, old: np.array([old[0], *p[1 : len(p) - len(rest)], *(old[1] for _ in rest)]),
+            "absorb": lambda p, weights, old: np.array([old[0], *p[1:]]),
             "apart": "friction",
             "special": lambda p: np.array([p[0], rest_of(p)]),
         },
     )
+
+
+def hung_dress_pack(joint: int, place: str, spring: bool) -> Hypothesis:
+    """A ``dress_pack`` that is at rest at another angle than zero.
+
+    Args:
+        spring: whether it is begun from a balancing spring; else from a bundle.
+    """
+
+    def widens(p: np.ndarray, scale: SignalScale) -> list[np.ndarray]:
+        if not spring:
+            return [np.array([p[0], p[1], TURNS * scale.v, 0.0, 0.0])]
+        return [np.array([p[0], share * p[0] * scale.q, TURNS * scale.v, 0.0, p[1]]) for share in RUBS]
+
+    plain = dress_pack(joint, place, hung=True)
+    own = {"holds": "gravity_spring" if spring else "dress_pack", "widens": widens}
+    return replace(plain, options=plain.options | own)
