@@ -186,7 +186,9 @@ def cause_remains(found: Findings, refuted: bool) -> bool:
     """Whether something is left that no name accounts for."""
     chi2 = found.final.chi2_per_dof
     much = chi2 > LEFT_ERROR or (chi2 > LEFT_NOISE and found.left > LEFT_SHARE)
-    return found.result.detected and (refuted or much or bool(found.belied) or not named_effects(found.final))
+    named = named_effects(found.final)
+    false = bool(found.belied) or any(unlike_a_load(e, found.final) for e in named)
+    return found.result.detected and (refuted or much or false or not named)
 
 
 def named_causes(found: Findings, refuted: bool) -> Iterator[Cause]:

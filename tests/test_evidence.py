@@ -1307,8 +1307,9 @@ def test_a_verdict_holds_the_note_and_the_doubt(identified, named, monkeypatch):
     for doubt in ("piece_of_a_curve", "unlike_a_load"):
         with monkeypatch.context() as patched:
             patched.setattr(f"ident.conclude.{doubt}", lambda *args: True)
-            (cause,) = conclude(Findings(data, setup, worse, heard, preds, preds)).causes
-            assert cause.probability < 0.5
+            verdict = conclude(Findings(data, setup, worse, heard, preds, preds))
+            assert verdict.causes[0].probability < 0.5
+            assert verdict.unexplained_verdict == UNKNOWN or doubt == "piece_of_a_curve"
     verdict = conclude(Findings(data, setup, worse, heard, preds, preds, belied={h.key}))
     assert verdict.causes[0].probability < 0.5 and verdict.unexplained_verdict == UNKNOWN
     assert any("hysteresis at elbow_joint" in note and "held out" in note for note in verdict.notes)
