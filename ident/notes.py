@@ -150,7 +150,7 @@ def roll_off_note(problem: Problem) -> str:
 def excitation_note(problem: Problem) -> str:
     """An excitation that acts later than the torque of which it is a part."""
     return (
-        f"The excitation `r` acts {1e3 * problem.sampling.late_excitation:.3g} ms later than the rest of the recorded torque,"
+        f"The excitation (channel r) acts {1e3 * problem.sampling.late_excitation:.3g} ms later than the rest of the recorded torque,"
         " alike at all joints, as one does that is held from sample to sample while the controller is faster. That is taken"
         " for how the torque was made, and not for a cause."
     )

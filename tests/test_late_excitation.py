@@ -7,6 +7,7 @@ import pytest
 
 from ident.diagnosis import diagnose
 from ident.identification import identify
+from sim.effects import make_effect
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
 
@@ -74,3 +75,13 @@ def test_a_reference_of_positions_is_no_torque(sampled):
 def test_without_a_recorded_excitation_nothing_is_said(sampled):
     early = asked_early(sampled, [LAG] * 3)
     assert lag_of(replace(early, segments=tuple(replace(s, r=None) for s in early.segments))) == 0.0
+
+
+@pytest.mark.slow
+def test_link_encoders_are_compared_beside_a_late_excitation(locked, tmp_path):
+    late = make_effect("sensor_delay", "elbow_joint", delay=2e-3, channel="q_link")
+    data = quick_experiment(small_plan(locked, 9, levels=(1.0,)), [late], seed=9, link_encoders=True)
+    verdict = diagnose(through_files(asked_early(replace(data, input_hold="none"), [LAG] * 3), tmp_path))
+    assert [(c.effect, c.joint, c.channel) for c in verdict.causes] == [("sensor_delay", "elbow_joint", "q_link")]
+    assert verdict.causes[0].parameters["delay"].value == pytest.approx(2e-3, rel=0.02)
+    assert any("later than the rest of the recorded torque" in note for note in verdict.notes)
