@@ -12,10 +12,12 @@ from ident.baseline import UNDETERMINED
 from ident.dataset import Dataset
 from ident.evidence import Candidate, pointless
 from ident.extended import Prediction
+from ident.group import Group
 from ident.identification import RUNAWAY, Setup
 from ident.link_sensor import LinkDelay
 from ident.lost_samples import LostSamples
 from ident.model import Effect, is_along_record
+from ident.naming import called, told_name
 from ident.next_experiment import NextExperiment, advice
 from ident.notes import (
     along_note,
@@ -26,6 +28,7 @@ from ident.notes import (
     few_note,
     held_out_note,
     inertia_note,
+    load_note,
     lost_note,
     nameless_note,
     record_note,
@@ -62,12 +65,10 @@ from ident.trust import (
 from ident.units import linear_names, unit_at
 from ident.values import (
     baseline_values,
-    called,
     extended_baseline,
     inertia_values,
     named_effects,
     reported_parameters,
-    usual_swing,
 )
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
@@ -187,8 +188,14 @@ def cause_remains(found: Findings, refuted: bool) -> bool:
     chi2 = found.final.chi2_per_dof
     much = chi2 > LEFT_ERROR or (chi2 > LEFT_NOISE and found.left > LEFT_SHARE)
     named = named_effects(found.final)
-    false = bool(found.belied) or any(unlike_a_load(e, found.final) for e in named)
+    false = bool(found.belied) or bool(no_loads(found))
     return found.result.detected and (refuted or much or false or not named)
+
+
+def no_loads(found: Findings) -> list[Effect]:
+    """Loads that no arm could carry (``trust.unlike_a_load``)."""
+    loads = [e for e in named_effects(found.final) if e.hypothesis.effect == "payload"]
+    return [e for e in loads if unlike_a_load(e, found.final, found.final.covariance())]
 
 
 def named_causes(found: Findings, refuted: bool) -> Iterator[Cause]:
@@ -199,8 +206,7 @@ def named_causes(found: Findings, refuted: bool) -> Iterator[Cause]:
     for effect in named_effects(found.final):
         of_effect = rounds[effect.hypothesis.key]
         trust = trust_in(effect, of_effect, found, doubted, covariance)
-        swing = usual_swing(found.last, effect.hypothesis.joint)
-        cause = _cause(effect, of_effect.candidates, found.final, covariance, trust, swing)
+        cause = _cause(effect, of_effect.candidates, found.final, covariance, trust, found.setup.problem.groups)
         yield from (cause, *_drifting_friction(cause))
 
 
@@ -227,7 +233,7 @@ def trust_in(effect: Effect, of_effect: Round, found: Findings, doubted: bool, c
         pointless(effect, found.final.model.par.stiffness[h.joint])
         or too_fast(problem, found.last, effect)
         or piece_of_a_curve(effect, found.final, found.last)
-        or unlike_a_load(effect, found.final)
+        or unlike_a_load(effect, found.final, covariance)
         or within_steps(effect, found.setup.steps)
         or shadowed(of_effect, found.result.rounds)
         or h.key in found.belied
@@ -286,6 +292,7 @@ def notes_on(found: Findings, causes: Sequence[Cause], tones: Sequence[Tone], de
     yield from (tone_note(x, joints[x.joint]) for x in tones)
     yield from (lost_note(x, joints[x.joint]) for x in found.lost)
     yield from (belied_note(e) for e in named if e.hypothesis.key in found.belied)
+    yield from (load_note(e) for e in no_loads(found))
     yield from (nameless_note(e, problem.structure) for e in final.model.effects if e.hypothesis.decoy)
     yield from (record_note(e) for e in named if is_along_record(e.hypothesis))
     if found.gain is not None and found.judged is not None:
@@ -340,34 +347,34 @@ def _late(late: LinkDelay, joint: str) -> Cause:
 
 
 def _cause(
-    effect: Effect, candidates: Sequence[Candidate], final: Fit, covariance: np.ndarray, trust: float, swing: float
+    effect: Effect,
+    candidates: Sequence[Candidate],
+    final: Fit,
+    covariance: np.ndarray,
+    trust: float,
+    groups: Sequence[Group],
 ) -> Cause:
     """What an effect is called, and what else could be in its place.
 
     Args:
-        swing: of ``usual_swing`` at its joint.
+        groups: as of ``naming.called``.
     """
     h = effect.hypothesis
     joints = h.options.get("joints", ())
-    name, others_called = called(effect, swing)
-
-    def name_of(c: Candidate) -> str:
-        tried = [e for e in c.fit.model.effects if e.hypothesis.key == c.hypothesis.key]
-        return "unknown" if c.hypothesis.decoy else called(tried[0], swing)[0] if tried else c.hypothesis.effect
-
-    places = [(name_of(c), c.hypothesis.place, c.hypothesis.options.get("joints", ())) for c in candidates]
-    same = [c for c, at in zip(candidates, places, strict=True) if at == (name, h.place, joints)]
-    own = sum(c.probability for c in same) if candidates else 1.0
-    others: dict[tuple[str, str], float] = {}
-    for c, (other, place, _) in zip(candidates, places, strict=True):
-        if all(c is not x for x in same) and c.probability > 1e-3:
-            others[(other, place)] = others.get((other, place), 0.0) + c.probability
+    name, parameter_called = called(effect, groups)
+    own, others = 0.0 if candidates else 1.0, dict[tuple[str, str], float]()
+    for c in candidates:
+        other, place = told_name(c, groups), c.hypothesis.place
+        if (other, place, c.hypothesis.options.get("joints", ())) == (name, h.place, joints):
+            own += c.probability
+        elif c.probability > 1e-3:
+            others[other, place] = others.get((other, place), 0.0) + c.probability
     parameters = reported_parameters(effect, final, covariance)
     return Cause(
         effect=name,
         joint=h.place,
-        parameters={others_called[k]: parameters[k] for k in others_called}
-        | {k: v for k, v in parameters.items() if k not in others_called},
+        parameters={parameter_called[k]: parameters[k] for k in parameter_called}
+        | {k: v for k, v in parameters.items() if k not in parameter_called},
         probability=float(np.clip(own * trust, 0.0, 0.999)),
         evidence=told(effect, final.model.structure, {k: v.value for k, v in parameters.items()}),
         alternatives=tuple(

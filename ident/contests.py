@@ -60,12 +60,8 @@ def rematched(problem: Problem, current: Fit, rounds: Sequence[Round], workers: 
         winner = found.candidates[0].hypothesis
         there = {e.hypothesis.key for e in current.model.effects}
         blurred = len(there) > 1 or outdone(found) or nearly_settled(problem, current, winner)
-        if (
-            (blurred or wider_laws(problem, current, winner))
-            and winner.key in there
-            and not winner.decoy
-            and not workers.late
-        ):
+        blurred = blurred or bool(forms_to_try(problem, current, winner))
+        if blurred and winner.key in there and not winner.decoy and not workers.late:
             current, found = contest(problem, current, found, workers)
         out.append(found)
     return current, out
@@ -128,17 +124,20 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         now[c.hypothesis.key] = now.get(c.hypothesis.key, 0.0) + c.probability
     seen = {c.hypothesis.key for c in found.candidates}
     new = [c for c in weighed if c.hypothesis.key not in seen]
-    known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in found.candidates]
+    new_form = best.hypothesis.key in seen and all(c.hypothesis is not best.hypothesis for c in found.candidates)
+    old = [best if new_form and c.hypothesis.key == best.hypothesis.key else c for c in found.candidates]
+    known = new + [replace(c, probability=now.pop(c.hypothesis.key, 0.0)) for c in old]
     known.sort(key=lambda c: (c.hypothesis.key != best.hypothesis.key, -c.probability))
     return current, replace(found, candidates=tuple(known))
 
 
 def best_of_each(ran: Sequence[Candidate]) -> list[Candidate]:
     """The best fit of every name. A body with its load and without keep one each: as good, they may ask for very
-    different changes."""
-    best: dict[tuple[tuple[str, str], bool], Candidate] = {}
+    different changes; so do a law and its wider form, of which the former costs more and has fewer parameters."""
+    best: dict[tuple, Candidate] = {}
     for c in sorted(ran, key=lambda c: c.fit.cost):
-        best.setdefault((c.hypothesis.key, c.hypothesis.options.get("with_load", False)), c)
+        h = c.hypothesis
+        best.setdefault((h.key, h.options.get("with_load", False), "holds" in h.options), c)
     return list(best.values())
 
 
@@ -209,17 +208,24 @@ def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
 
 
 def wider_laws(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:
-    """Laws that hold another as a special case, where its shape can be what is missing: of drives and encoders
-    wherever their joint has more than noise left."""
-    alone, others = problem.motions_alone, {e.hypothesis.key for e in current.model.effects} - {h.key}
-    laws = wider_forms(h) if not alone and h.joint >= 0 and unsettled_at(current, h.joint) else []
+    """Laws that hold another as a special case, where its shape can be what is missing."""
+    laws = forms_to_try(problem, current, h)
     if nearly_settled(problem, current, h):
         laws += [
             x
-            for x in catalogue(problem.structure, motions_alone=alone)
+            for x in catalogue(problem.structure, motions_alone=problem.motions_alone)
             if (x.options.get("absorbs"), x.place) == h.key and "widens" in x.options
         ]
+    others = {e.hypothesis.key for e in current.model.effects} - {h.key}
     return [x for x in laws if x.key not in others]
+
+
+def forms_to_try(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:
+    """``wider_forms`` where the joint of a law has more than noise left, which no other joint answers for; none in
+    motions alone, below the modes of the links."""
+    if problem.motions_alone or h.joint < 0 or not unsettled_at(current, h.joint):
+        return []
+    return wider_forms(h)
 
 
 def nearly_settled(problem: Problem, current: Fit, h: Hypothesis) -> bool:

@@ -22,6 +22,7 @@ from ident.graybox import Parameters, equilibrium, linearise
 from ident.group import Group
 from ident.information import motor_loads
 from ident.model import simulated_laws
+from ident.naming import told_name
 from ident.parallel import map_threads
 from ident.plan import Plan, make_plan
 from ident.problem import NOT_COMPUTED, Problem
@@ -83,7 +84,7 @@ class _Option:
 
 def separating_experiment(problem: Problem, result: Attribution) -> NextExperiment | None:
     """For the least certain cause with a rival; None where there is none, or no periodic data."""
-    pair = _rivals(result)
+    pair = _rivals(result, problem.groups)
     groups = [g for g in problem.groups if g.window is None]
     if pair is None or not groups:
         return None
@@ -91,7 +92,7 @@ def separating_experiment(problem: Problem, result: Attribution) -> NextExperime
     options = list(_options(problem, groups, a.hypothesis.joint))
     nats = map_threads(lambda option: _separation(problem, option, a.fit, b.fit), options)
     best = int(np.argmax(nats))
-    names = f"{a.hypothesis.effect} at {a.hypothesis.place} from {b.hypothesis.effect} at {b.hypothesis.place}"
+    names = " from ".join(f"{told_name(c, problem.groups)} at {c.hypothesis.place}" for c in pair)
     if not nats[best] > ENOUGH:
         text = (
             f"To tell {names}: no other amplitude or posture would; of {len(options)} experiments the best is expected"
@@ -110,16 +111,16 @@ def separating_experiment(problem: Problem, result: Attribution) -> NextExperime
     return NextExperiment(text, float(nats[best]), _plan(problem, o))
 
 
-def _rivals(result: Attribution) -> tuple[Candidate, Candidate] | None:
+def _rivals(result: Attribution, groups: Sequence[Group]) -> tuple[Candidate, Candidate] | None:
     """The winner of the least certain round and its best rival of another name or place."""
     pairs = []
     for found in result.rounds:
         first = found.candidates[0]
-        key = (first.hypothesis.effect, first.hypothesis.place)
+        name = told_name(first, groups), first.hypothesis.place
         rivals = [
             c
             for c in found.candidates[1:]
-            if (c.hypothesis.effect, c.hypothesis.place) != key and not c.hypothesis.decoy and c.probability >= TIED
+            if not c.hypothesis.decoy and c.probability >= TIED and (told_name(c, groups), c.hypothesis.place) != name
         ]
         if rivals and not first.hypothesis.decoy:
             pairs.append((first, rivals[0]))

@@ -156,6 +156,15 @@ def excitation_note(problem: Problem) -> str:
     )
 
 
+def load_note(effect: Effect) -> str:
+    """A load with the inertia of a body that no arm could carry."""
+    largest = max(effect.value(f"inertia_{axis}") for axis in "xyz")
+    return (
+        f"The payload has a radius of gyration of {np.sqrt(largest / effect.value('mass')):.2g} m, more than an arm could"
+        " carry: something else moves at the flange."
+    )
+
+
 def along_note(gain: Gain, judged: Gain) -> tuple[str, ...]:
     """Where a gear rattles: what the extended model leaves along the record, by which its law is trusted."""
     if not judged.after < ALONG * gain.after:

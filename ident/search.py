@@ -346,7 +346,7 @@ def best_named(ranked: Sequence[tuple[Hypothesis, T]], count: int, decoys: int) 
 
 
 def choose(scores: Sequence[Score]) -> list[Score]:
-    """The screened hypotheses worth a refit: the best, no effect more than ``PER_EFFECT`` times.
+    """The screened hypotheses worth a refit: the best, no effect at more than ``PER_EFFECT`` places.
 
     A linear step hardly tells where a hinge is: if one is worth a refit, so are those before and after other joints
     that come near it.
@@ -354,7 +354,7 @@ def choose(scores: Sequence[Score]) -> list[Score]:
     worth: list[tuple[Hypothesis, Score]] = []
     top = scores[0].gain if scores else 0.0
     for score in scores:
-        same = sum(h.effect == score.hypothesis.effect for h, _ in worth)
+        same = len({h.place for h, _ in worth if h.effect == score.hypothesis.effect} - {score.hypothesis.place})
         if score.start is not None and same < PER_EFFECT and score.gain >= KEEP_RATIO * top:
             worth.append((score.hypothesis, score))
     out = [score for _, score in best_named(worth, REFITS, DECOYS)]

@@ -43,6 +43,7 @@ HALF_TRUSTED = 0.1
 DENIED_SHARE = 0.25
 CHANCE = 3.0  # standard deviations of that fall, within which it may be short by chance
 SPRINGS = "gravity_spring", "dress_pack"  # of which the torque follows the position of the link
+SURE = 2.0  # standard deviations of the inertia of a load, by which it is too large
 LONGEST_LOAD = 1.0  # m, radius of gyration of a load, or half of the length of the arm where that is more
 PATCHES = 3  # bodies and hinges other than those described, from which no name is trusted
 LEFT_ERROR = 3.0  # chi2 per degree of freedom above which an unknown cause remains however strong the named ones are
@@ -220,14 +221,20 @@ def piece_of_a_curve(effect: Effect, final: Fit, predictions: Sequence[Predictio
     return bool(springs and parts) and any(e is effect for e in (*springs, *parts))
 
 
-def unlike_a_load(effect: Effect, final: Fit) -> bool:
-    """Whether an effect is a load that reaches further than an arm could carry one: a few grams with the inertia of a
-    rod of metres are something else that moves at the flange."""
-    if effect.hypothesis.effect != "payload":
+def unlike_a_load(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
+    """Whether an effect is a load that reaches further than an arm could carry one, beyond chance: a few grams with the
+    inertia of a rod of metres are something else that moves at the flange."""
+    h = effect.hypothesis
+    if h.effect != "payload":
         return False
-    largest = max(effect.value(f"inertia_{axis}") for axis in "xyz")
+
+    def log_and_std(name: str) -> tuple[float, float]:
+        i = final.names.index(h.coordinate(name))
+        return float(np.log(effect.value(name))), float(np.sqrt(max(covariance[i, i], 0.0)))
+
+    mass, least = log_and_std("mass")[0], (x - SURE * std for x, std in (log_and_std(f"inertia_{a}") for a in "xyz"))
     reach = sum(float(np.linalg.norm(x.translation)) for x in final.model.structure.model.jointPlacements)
-    return bool(np.sqrt(largest / effect.value("mass")) > max(LONGEST_LOAD, 0.5 * reach))
+    return bool(0.5 * (max(least) - mass) > np.log(max(LONGEST_LOAD, 0.5 * reach)))
 
 
 def within_steps(effect: Effect, steps: Sequence[Steps]) -> bool:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from ident.baseline import UNDETERMINED
 from ident.chain import INERTIAL, Structure
 from ident.evidence import ABSENT
-from ident.extended import Prediction
 from ident.hypotheses import Hypothesis
 from ident.model import Effect
 from ident.rigid import RigidFit
@@ -18,32 +15,11 @@ from ident.units import linear_names, parameter_unit, unit_at
 from ident.verdict import Value
 
 AXIS_STEP = 1e-6  # of a tilt
-MOVES = 0.1  # of the largest motion of a joint, from which it moves
 
 
 def named_effects(final: Fit) -> tuple[Effect, ...]:
     """The effects of a model that are causes, and no part of its baseline."""
     return tuple(e for e in final.model.effects if not e.hypothesis.options.get("baseline"))
-
-
-def called(effect: Effect, swing: float) -> tuple[str, Mapping[str, str]]:
-    """The name under which an effect is told, and those of parameters that are called otherwise there.
-
-    A law may be so near to a special case of it that it goes by that name.
-
-    Args:
-        swing: of ``usual_swing`` at its joint.
-    """
-    h = effect.hypothesis
-    special = h.options["called"](effect.p, swing) if "called" in h.options else None
-    return special or (h.effect, {})
-
-
-def usual_swing(preds: Sequence[Prediction], joint: int) -> float:
-    """Rms motion of a joint about its mean, rad: the median over records in which it moves."""
-    powers = np.concatenate([np.sum(np.abs(p.group.Q[:, 1:, joint]) ** 2, axis=1) for p in preds])
-    rms = np.sqrt(2.0 * powers)
-    return float(np.median(rms[rms >= MOVES * rms.max()]))
 
 
 def baseline_values(result: Fit) -> tuple[dict[str, Value], tuple[str, ...]]:

@@ -158,10 +158,18 @@ def test_a_lagging_drive_loses_its_time_constant(bench, lag):
     assert lost_time(model, data) == pytest.approx(lag, rel=1e-2)
 
 
-@pytest.mark.parametrize("stepped", [-0.25, 0.25])
+@pytest.mark.parametrize("stepped", [-0.25, 0.01, 0.05, 0.25, 0.4])
 def test_a_lag_that_is_stepped_in_time_loses_as_much_more_or_less(bench, stepped):
     model, data = exported(bench, cause("torque_lag", JOINT, time_constant=1e-3, stepped=stepped))
     assert lost_time(model, data) == pytest.approx(1e-3 * (1.0 + stepped), rel=1e-2)
+
+
+@pytest.mark.parametrize("square", [0.2, 0.39, 0.499, 0.6])
+def test_a_lag_of_second_order_loses_its_time_constant_too(bench, square):
+    """As a filter and a delay, or where it hardly loses gain as a delay."""
+    model, data = exported(bench, cause("torque_lag", JOINT, time_constant=1e-3, square=square))
+    assert lost_time(model, data) == pytest.approx(1e-3, rel=1e-2)
+    assert model.actuator_delay[0] > 0.0
 
 
 @pytest.mark.parametrize("lead", [2e-3, 9.5e-3])

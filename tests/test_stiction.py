@@ -6,6 +6,7 @@ that holds it as long as no more than its static size is asked, to the step (Kar
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from ident.diagnosis import diagnose
 from ident.extended import predict
 from ident.group import Group
 from ident.hypotheses import catalogue
-from ident.hypotheses.friction import within
+from ident.hypotheses.friction import RESOLVED, other_turn, within
 from ident.identification import set_up
 from ident.model import Effect, Model, along_record
 from ident.output_noise import noise_covariance
@@ -392,3 +393,11 @@ def test_what_is_asked_of_a_friction_at_its_size_loses_little_of_one_side_of_its
     assert np.array_equal(given[np.abs(asked) < 1.5], asked[np.abs(asked) < 1.5])
     small = within(asked, np.full(asked.shape, -0.2), np.full(asked.shape, 0.2), 1.0)
     assert small.min() == -0.2 and small.max() == 0.2 and np.all(small * asked >= 0.0)
+
+
+def test_a_friction_is_begun_from_either_side_of_what_rest_tells():
+    """Turning at once where it turns within what is seen, and the other way round."""
+    group = SimpleNamespace(window=None, rest=np.ones((1, 4, 1), bool), turn_noise=np.array([1e-3]))
+    assert other_turn([group], 0, 1.0) == pytest.approx(0.1 * RESOLVED * 1e-3)
+    assert other_turn([group], 0, 1e-5) == pytest.approx(2.0 * RESOLVED * 1e-3)
+    assert other_turn([SimpleNamespace(window=None, rest=None)], 0, 1.0) is None

@@ -30,7 +30,6 @@ PER_JOINT = (
     transmission.softening_stiffness,
     transmission.hysteresis,
     transmission.transmission_error,
-    link_springs.gravity_spring,
     sensing.sensor_delay,
 )
 
@@ -56,6 +55,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
             out.append(friction.bristled_stribeck(j, name))
         if not linear[j]:  # before the plain one, which has its name
             out.append(link_springs.spring_between_points(j, name))
+        out.append(link_springs.gravity_spring(j, name, bool(linear[j])))
         out += [make(j, name, not motions_alone) for make in SHARPER]
         out += [make(j, name) for make in PER_JOINT]
         out.append(friction.presliding_friction(j, name, damped=not motions_alone))
@@ -105,16 +105,21 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
 
 
 def wider_forms(hypothesis: Hypothesis) -> list[Hypothesis]:
-    """Forms of a law of an encoder or of a drive that hold it and have the same name, or that of a law next to it: of a
-    lag or a delay the lag of second order, of an encoder out of centre the one that is oval too, of a balancing spring
-    or a bundle of cables the bundle with another rest. None of others."""
+    """Laws with more parameters that hold another one, under its name or that of a law next to it; none of others.
+
+    Of a lag or a delay the lag of second order; of an encoder out of centre the one that is oval too; of a balancing
+    spring the one between two points; of that and of a bundle of cables the bundle with another rest.
+    """
     h = hypothesis
     if "holds" in h.options:
         return []
     if h.effect == "encoder_eccentricity":
         return [sensing.encoder_eccentricity(h.joint, h.place, h.options["turns"], oval=True)]
-    if h.effect in ("gravity_spring", "dress_pack"):
-        return [link_springs.hung_dress_pack(h.joint, h.place, h.effect == "gravity_spring")]
+    if h.effect == "gravity_spring":
+        between = [] if h.options["linear"] else [link_springs.spring_between_points(h.joint, h.place)]
+        return [*between, link_springs.hung_dress_pack(h.joint, h.place, spring=True)]
+    if h.effect == "dress_pack":
+        return [] if h.options["yields"] else [link_springs.hung_dress_pack(h.joint, h.place, spring=False)]
     lags = [make(h.joint, h.place, second=True) for make in (drive.torque_lag, sensing.sensor_lag)]
     return [x for x in lags if h.effect in (x.effect, x.options["holds"])]
 

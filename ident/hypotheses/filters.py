@@ -38,7 +38,7 @@ def form(effect: str, stepped: bool, second: bool) -> tuple[tuple[Parameter, ...
     """Parameters of a lag beside its time constant, the filter, and options of its hypothesis.
 
     Args:
-        effect: whose special case it is where ``second``, as a lag of first order is.
+        effect: the delay that is nearly a special case of it where ``second``, beside the lag of first order.
         stepped: whether it may come by a share of the time constant later or sooner, as one that is stepped in time
             does by half of a step. Motions below the modes of the links do not show it.
         second: whether it is of second order, which between its two poles is part lag, part delay. Fitted where these

@@ -143,7 +143,9 @@ class Hypothesis:
             to start from where no linear step leads there. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
             place of one with parameters ``old`` at the same joint, ``widens(old, scale)`` starts to try of other
-            shapes. ``apart``: the parameter that sets it apart from that special case, and ``special(p)`` the
+            shapes. ``holds`` names one that it holds and is asked for beside alone (``wider_forms``), from ``widens`` too.
+            ``called(p, swing)``: name, and names of parameters, of the special case that it is as good as at a joint that
+            swings so far; None where it is not. ``apart``: the parameter that sets it apart from that special case, and ``special(p)`` the
             parameters of the special case that it is where the data do not show this one, or where ``give(p)``, rad, is
             less than the noise of the position. ``essential`` names the parameters without any of which nothing is left
             of the effect, ``trivial(p, stiffness)`` says so of all parameters together, beside a gear of that
@@ -162,6 +164,8 @@ class Hypothesis:
                 linear, (L,).
             ``slope(p, q)``: of one that is not, true position per measured one at true positions; of a spring to the
                 link, N m/rad at positions of that.
+            ``rest(p)``: angle about which a law at the link is asked. ``turns``: of an encoder in a turn of its joint.
+                ``linear``: at a linear joint. ``yields``: its friction turns over with the path.
             ``nearer(p)``: the hypothesis of the same hinge sought from another axis, and its parameters, where its own
                 is nearer to that.
             ``of_record``: of a decoy that lies in how the record was made, and so leaves no cause unknown.

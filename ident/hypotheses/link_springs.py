@@ -23,8 +23,12 @@ REST = Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, nuisance=Tr
 YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
 
 
-def gravity_spring(joint: int, place: str) -> Hypothesis:
-    """Balancing spring on the link: ``stiffness (q_link - rest_angle)`` against it."""
+def gravity_spring(joint: int, place: str, linear: bool = False) -> Hypothesis:
+    """Balancing spring on the link: ``stiffness (q_link - rest_angle)`` against it.
+
+    Args:
+        linear: whether the joint is, so that no spring between two points turns with it.
+    """
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         q = motion.q_link(j)
@@ -51,6 +55,7 @@ def gravity_spring(joint: int, place: str) -> Hypothesis:
         options={
             "trivial": lambda p, k: abs(p[1]) > 0.95 * FARTHEST_REST,  # a constant torque
             "slope": lambda p, q: p[0],
+            "linear": linear,
         },
     )
 
@@ -87,7 +92,11 @@ def spring_between_points(joint: int, place: str) -> Hypothesis:
         parameters=(stiffness, replace(rest, lower=-2.0 * np.pi, upper=2.0 * np.pi), CONSTANT, STRETCH),
         law=law,
         screen=screen,
-        options={"slope": slope},
+        options={
+            "slope": slope,
+            "holds": "gravity_spring",
+            "widens": lambda p, scale: [np.array([*p[:2], CONSTANT.center, STRETCH.center])],
+        },
     )
 
 
@@ -145,6 +154,7 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False,
                 else kernels.Law(kernels.LINK, p[0], p[1], p[2], lead=float(p[3]) if lead else 0.0)
             ),
             "rest": rest_of,
+            "yields": yields,
             # Without a spring to speak of it is a second friction, which a stiff gear hardly tells from that of the
             # motor.
             "trivial": lambda p, k: p[0] < 0.2 * p[1],
@@ -165,7 +175,7 @@ def hung_dress_pack(joint: int, place: str, spring: bool) -> Hypothesis:
 
     def widens(p: np.ndarray, scale: SignalScale) -> list[np.ndarray]:
         if not spring:
-            return [np.array([p[0], p[1], TURNS * scale.v, 0.0, 0.0])]
+            return [np.array([*p, *(0.0 for _ in range(4 - len(p))), 0.0])]
         return [np.array([p[0], share * p[0] * scale.q, TURNS * scale.v, 0.0, p[1]]) for share in RUBS]
 
     plain = dress_pack(joint, place, hung=True)

@@ -236,7 +236,7 @@ NATIVE = {
     "presliding_friction": "bristle of passive:{index}, or springs friction:{index} which yield",
     "cogging": "cogging of passive:{index}",
     "torque_constant": "gear of drive:{place}",
-    "torque_lag": "first-order filter of drive:{place}",
+    "torque_lag": "first-order filter and delay of drive:{place}",
     "torque_delay": "delay of drive:{place}",
     "torque_saturation": "forcerange of drive:{place}",
     "hardening_stiffness": "cubic stiffness of gear:{place}",
@@ -293,16 +293,21 @@ def _stepping(causes: Sequence[Cause], fastest: float) -> tuple[float, mujoco.mj
         if c.effect == "torque_delay":
             parts.append(1.5 * TIMESTEP / c.parameters["delay"].value)
         elif c.effect == "torque_lag":
-            lag, _ = lag_and_delay({name: value.value for name, value in c.parameters.items()})
-            parts.append(TIMESTEP / max(lag, TIMESTEP / MOST_REFINED))
+            lag, late = lag_and_delay({name: value.value for name, value in c.parameters.items()})
+            parts += [steps * TIMESTEP / time for steps, time in ((1.0, lag), (1.5, late)) if time > 0.0]
     return TIMESTEP / min(int(np.ceil(max(parts))), MOST_REFINED), mujoco.mjtIntegrator.mjINT_RK4
 
 
 def lag_and_delay(p: Mapping[str, float]) -> tuple[float, float]:
-    """Time constant of a filter of first order and the delay beside it that a lag of second order is up to the second
-    power of frequency, s; below nought where it comes sooner."""
-    lag = p["time_constant"] * np.sqrt(max(1.0 - 2.0 * p.get("square", 0.0), 0.0))
-    return lag, p["time_constant"] * (1.0 + p.get("stepped", 0.0)) - lag
+    """Time constant of a filter of first order and the delay beside it that a ``torque_lag`` is up to the second power
+    of frequency, s; the delay is below nought where it comes sooner. One of second order that hardly loses gain is a
+    delay alone, and a delay far below a step a part of the lag."""
+    late_by, square = p["time_constant"] * (1.0 + p.get("stepped", 0.0)), p.get("square", 0.0)
+    lag = p["time_constant"] * np.sqrt(max(1.0 - 2.0 * square, 0.0))
+    if square and lag < TIMESTEP:
+        return 0.0, late_by
+    delay = late_by - lag
+    return (late_by, 0.0) if 0.0 < delay < TIMESTEP / MOST_REFINED else (lag, delay)
 
 
 def stage_lead(timestep: float, integrator: int) -> float:
@@ -363,14 +368,12 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         _add_delay(drive, p["delay"] + lead, step)
     elif cause.effect == "torque_lag":
         lag, late = lag_and_delay(p)
-        if lag >= step:
+        if lag > 0.0:
             exact = spec.option.integrator != mujoco.mjtIntegrator.mjINT_RK4
             drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
             drive.dynprm = [lag + min(late, 0.0), *([0] * (len(drive.dynprm) - 1))]
-        else:
-            late += lag
         if late > 0.0:
-            _add_delay(drive, late, step)  # a filter integrates its input, whenever stages read it
+            _add_delay(drive, late + (0.0 if drive.delay else stage_lead(step, spec.option.integrator)), step)
     elif cause.effect == "torque_saturation":
         drive.forcelimited, drive.forcerange = True, [-p["limit"], p["limit"]]
     elif cause.effect == "hardening_stiffness":
