@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.hypotheses.link_springs import spring_between_points
+from ident.hypotheses.slips import parallel_slips
 from ident.hypotheses.yielding import along_path, bristle, elastoplastic
 from ident.show.dips import square_dips
 from ident.show.export import build_mjcf
@@ -134,6 +135,16 @@ def test_hysteresis_that_yields_gradually_is_slips_near_to_it(bench, exponent, r
     half = len(q) // 2
     off, of_one = (np.std((x - law)[half:]) for x in (-forced(model, data, q, v), elastoplastic(q[None], 80.0, 0.2)[0]))
     assert off < of_one and off < 0.12 * np.std(law)
+
+
+def test_presliding_friction_of_slips_is_these_slips(bench):
+    p = {"stiffness": 120.0, "coulomb": 0.3, "spread": 0.8}
+    model, data = exported(bench, cause("presliding_friction", JOINT, **p))
+    _, q, v = swing(model, 8e-3, 2.0)
+    each, limits = parallel_slips(*p.values())
+    law = sum(elastoplastic(q[None], each, x, begins=True)[0] for x in limits)
+    half = len(q) // 2
+    assert np.abs(forced(model, data, q, v) + law)[half:].max() < 0.02 * 0.3
 
 
 def test_sharp_presliding_friction_is_slips(bench):

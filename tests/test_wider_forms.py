@@ -36,6 +36,7 @@ def test_wider_forms_are_asked_for_where_the_plain_ones_stand(locked, tmp_path):
         "sensor_delay": ["sensor_lag"],
         "sensor_lag": ["sensor_lag"],
         "encoder_eccentricity": ["encoder_eccentricity"],
+        "presliding_friction": ["presliding_friction"],
         "gravity_spring": ["gravity_spring", "dress_pack"],
         "dress_pack": ["dress_pack"],
     }

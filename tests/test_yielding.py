@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from ident.extended import predict
 from ident.hypotheses import catalogue
 from ident.hypotheses.friction import presliding_friction
+from ident.hypotheses.slips import parallel_slips, slipping_friction
 from ident.hypotheses.yielding import (
     SLIP,
     along_path,
@@ -177,3 +178,29 @@ def test_a_bristle_whose_limit_falls_with_speed_is_that_of_lugre():
     assert found == pytest.approx(exact.y[0], abs=2e-3)
     fast = np.abs(velocity(t)) > 0.9 * np.max(np.abs(velocity(t)))
     assert np.max(np.abs(found)) > 1.2 * np.max(np.abs(found[fast]))  # it falls, and late
+
+
+@pytest.mark.parametrize("spread", [0.05, 0.7, 2.0])
+def test_slips_in_parallel_add_up_to_one_element(spread):
+    each, limits = parallel_slips(STIFFNESS, LIMIT, spread)
+    assert each * len(limits) == pytest.approx(STIFFNESS) and limits.sum() == pytest.approx(LIMIT)
+    assert np.std(np.log(limits)) == pytest.approx(spread, rel=0.15)
+
+
+def test_slips_in_parallel_yield_as_far_as_one_element_and_close_their_small_loops():
+    """Masing: from where it turns back the torque follows the first curve, twice as large (Iwan 1966)."""
+    at = np.concatenate([np.linspace(0, 1, 400), np.linspace(1, -1, 800), np.linspace(-1, 0, 400)])
+    far = 20.0 * LIMIT / STIFFNESS * at[None]
+    motion = SimpleNamespace(q=lambda j: far, group=SimpleNamespace(window=None), time_step=1e-3)
+    law = slipping_friction(0, "axis").law
+    p = np.array([STIFFNESS, LIMIT, 0.7, 0.0])
+    assert np.abs(law(p, motion, 0, 1.0)).max() == pytest.approx(LIMIT)
+    small = 0.8 * LIMIT / STIFFNESS * at[None]
+    motion.q = lambda j: small
+    loop = law(p, motion, 0, 1.0)[0]
+    down, x = loop[400:1200], small[0, 400:1200]
+    motion.q, motion.group.window = (lambda j: 0.5 * (x[0] - x)[None]), np.ones(800)  # at rest where it begins
+    first = law(p, motion, 0, 1.0)[0]
+    assert np.abs(down - (down[0] - 2.0 * first)).max() < 0.01 * LIMIT
+    one = elastoplastic(small, STIFFNESS, LIMIT)[0]
+    assert np.ptp(loop) < np.ptp(one)  # what gives early has yielded

@@ -7,7 +7,18 @@ import itertools
 import numpy as np
 
 from ident.chain import Structure
-from ident.hypotheses import bodies, drifts, drive, friction, hinges, link_springs, sensing, structure, transmission
+from ident.hypotheses import (
+    bodies,
+    drifts,
+    drive,
+    friction,
+    hinges,
+    link_springs,
+    sensing,
+    slips,
+    structure,
+    transmission,
+)
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from robot_assets.robot import linear_joints
 
@@ -108,13 +119,16 @@ def wider_forms(hypothesis: Hypothesis) -> list[Hypothesis]:
     """Laws with more parameters that hold another one, under its name or that of a law next to it; none of others.
 
     Of a lag or a delay the lag of second order; of an encoder out of centre the one that is oval too; of a balancing
-    spring the one between two points; of that and of a bundle of cables the bundle with another rest.
+    spring the one between two points; of that and of a bundle of cables the bundle with another rest; of a bristle the
+    slips in parallel.
     """
     h = hypothesis
     if "holds" in h.options:
         return []
     if h.effect == "encoder_eccentricity":
         return [sensing.encoder_eccentricity(h.joint, h.place, h.options["turns"], oval=True)]
+    if h.effect == "presliding_friction":
+        return [slips.slipping_friction(h.joint, h.place)]
     if h.effect == "gravity_spring":
         between = [] if h.options["linear"] else [link_springs.spring_between_points(h.joint, h.place)]
         return [*between, link_springs.hung_dress_pack(h.joint, h.place, spring=True)]

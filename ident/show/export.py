@@ -12,6 +12,7 @@ import pinocchio as pin
 import tomlkit
 
 from ident.chain import LinkChange, build_structure
+from ident.hypotheses.slips import parallel_slips
 from ident.hypotheses.yielding import DAHL, SLIP
 from ident.show.dips import SQUARE, square_dips
 from ident.show.slips import maxwell_slips
@@ -353,7 +354,10 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
             bristle = [share * stiffness, 0.0, *(share * level for level in levels), velocity]
             _add_passive(spec, f"{index}.{part}" if part else index, name, lugre=bristle)
     elif cause.effect == "presliding_friction":
-        if p.get("exponent", DAHL) < MOST_ROUNDED:
+        if "spread" in p:
+            each, limits = parallel_slips(p["stiffness"], p["coulomb"], p["spread"])
+            _add_slips(spec, f"{FRICTION_SLIP}:{index}", [(each, x) for x in limits], {f"motor:{name}": 1.0})
+        elif p.get("exponent", DAHL) < MOST_ROUNDED:
             damping = p["stiffness"] * p.get("relaxation", 0.0)
             _add_passive(spec, index, name, lugre=[p["stiffness"], damping, p["coulomb"], p["coulomb"], 1.0])
         else:
