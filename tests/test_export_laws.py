@@ -137,6 +137,18 @@ def test_hysteresis_that_yields_gradually_is_slips_near_to_it(bench, exponent, r
     assert off < of_one and off < 0.12 * np.std(law)
 
 
+def test_a_bristle_that_goes_by_the_name_of_coulomb_friction_is_one(bench):
+    p = {"stiffness": 300.0, "exponent": 1.0, "relaxation": 0.0}
+    (model, data), (other, same) = (
+        exported(bench, cause(effect, JOINT, **size, **p))
+        for effect, size in (("coulomb_friction", {"torque": 0.3}), ("presliding_friction", {"coulomb": 0.3}))
+    )
+    _, q, v = swing(model, 8e-3, 2.0)
+    torque = forced(model, data, q, v)
+    assert np.abs(torque).max() == pytest.approx(0.3, rel=0.02)
+    assert torque == pytest.approx(forced(other, same, q, v), abs=1e-9)
+
+
 def test_presliding_friction_of_slips_is_these_slips(bench):
     p = {"stiffness": 120.0, "coulomb": 0.3, "spread": 0.8}
     model, data = exported(bench, cause("presliding_friction", JOINT, **p))

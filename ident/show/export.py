@@ -232,7 +232,7 @@ def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> 
 
 
 NATIVE = {
-    "coulomb_friction": "frictionloss of motor:{place} and, where it is asymmetric, passive:{index}",
+    "coulomb_friction": "frictionloss of motor:{place} and, where it is asymmetric or a bristle, passive:{index}",
     "stribeck_friction": "bristles passive:{index} ..., as stiff as the time step allows, for the turn of the sign",
     "presliding_friction": "bristle of passive:{index}, or springs friction:{index} which yield",
     "cogging": "cogging of passive:{index}",
@@ -342,7 +342,7 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
     motor, link = spec.joint(f"motor:{name}"), spec.joint(f"link:{name}")
     gear, drive = spec.tendon(f"gear:{name}"), spec.actuator(f"drive:{name}")
     step = spec.option.timestep
-    if cause.effect == "coulomb_friction":
+    if cause.effect == "coulomb_friction" and "stiffness" not in p:
         _add_friction(motor, p["torque"], step, p.get("lead", 0.0))
         bias = p["torque"] * p.get("asymmetry", 0.0)
         if bias:
@@ -353,16 +353,9 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         for part, (share, velocity) in enumerate(dips):
             bristle = [share * stiffness, 0.0, *(share * level for level in levels), velocity]
             _add_passive(spec, f"{index}.{part}" if part else index, name, lugre=bristle)
-    elif cause.effect == "presliding_friction":
-        if "spread" in p:
-            each, limits = parallel_slips(p["stiffness"], p["coulomb"], p["spread"])
-            _add_slips(spec, f"{FRICTION_SLIP}:{index}", [(each, x) for x in limits], {f"motor:{name}": 1.0})
-        elif p.get("exponent", DAHL) < MOST_ROUNDED:
-            damping = p["stiffness"] * p.get("relaxation", 0.0)
-            _add_passive(spec, index, name, lugre=[p["stiffness"], damping, p["coulomb"], p["coulomb"], 1.0])
-        else:
-            slips = maxwell_slips(p["stiffness"], p["coulomb"], p["exponent"], 1.0)
-            _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"motor:{name}": 1.0})
+    elif cause.effect in ("presliding_friction", "coulomb_friction"):
+        limit = p["coulomb"] if cause.effect == "presliding_friction" else p["torque"]
+        _add_bristles(spec, index, name, limit, p)
     elif cause.effect == "cogging":
         _add_passive(spec, index, name, cogging=[p["amplitude"], p["periods_per_rev"], p.get("phase", 0.0)])
     elif cause.effect == "torque_constant":
@@ -437,6 +430,21 @@ def _add_parallel(spec: mujoco.MjSpec, name: str, joint: str, stiffness: float, 
     spring.wrap_joint(f"link:{joint}", -1.0)
     spring.stiffness, spring.springlength = [stiffness, 0, 0], [-free, free]
     return spring
+
+
+def _add_bristles(spec: mujoco.MjSpec, index: int, name: str, limit: float, p: Mapping[str, float]) -> None:
+    """Friction that yields before it slips at ``limit``, N m: the bristle that MuJoCo has, or slips in parallel."""
+    exponent = p.get("exponent", DAHL)
+    if "spread" in p:
+        each, limits = parallel_slips(p["stiffness"], limit, p["spread"])
+        slips = [(each, x) for x in limits]
+    elif exponent >= MOST_ROUNDED:
+        slips = maxwell_slips(p["stiffness"], limit, exponent, 1.0)
+    else:
+        damping = p["stiffness"] * p.get("relaxation", 0.0)
+        _add_passive(spec, index, name, lugre=[p["stiffness"], damping, limit, limit, 1.0])
+        return
+    _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"motor:{name}": 1.0})
 
 
 def _add_spring_between_points(spec: mujoco.MjSpec, name: str, joint: mujoco.MjsJoint, p: Mapping[str, float]) -> None:
