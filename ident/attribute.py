@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.baseline import DETECTION_EXCESS, FAINT, HOPELESS, discrepancy_p_value, implausible, loud
-from ident.contests import weighed_again
+from ident.contests import forms_to_try, weighed_again
 from ident.faint import SEEN, hidden
 from ident.follow_up import as_loops, companions, from_other_motions
 from ident.hypotheses import Hypothesis, catalogue
@@ -288,6 +288,10 @@ def with_cause(task: Task, search: Search, question: Question, rounds: tuple[Rou
         if not carries_over(problem, search.current, current, joint, workers):
             rest = tuple(h for h in search.hypotheses if h.key != best.key)
             return elsewhere(replace(search, hypotheses=rest), joint)
+    if forms_to_try(problem, current, best):
+        # What its plain form lacks would hide what is left, or be taken for another cause.
+        current, last = weighed_again(problem, current, found_rounds[-1:], workers)
+        found_rounds = [*found_rounds[:-1], *last]
     if len(found_rounds) > 1:
         # What is sought next would make up for a cause that was named wrongly as long as this one was missing.
         current, earlier = weighed_again(problem, current, found_rounds[:-1], workers)

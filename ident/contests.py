@@ -87,7 +87,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
         e for e in alike(found, winner) if other(e.hypothesis) and all(e.hypothesis is not x.hypothesis for x in rivals)
     ]
     rivals += [*as_load(current, own, others), *elsewhere(problem, current, own, others)]
-    rivals += wider(problem, current, own)
+    rivals += [*wider(problem, current, own), *narrower(problem, own)]
 
     enough = to_compete(current.cost, current.count)
 
@@ -205,6 +205,19 @@ def wider(problem: Problem, current: Fit, effect: Effect) -> list[Effect]:
     preds = predictions(problem, current.model, current.remainders)
     scale = signal_scale(problem, preds, effect.hypothesis.joint, ())
     return [Effect(x, clip_to_bounds(x, p)) for x in laws for p in x.options["widens"](effect.p, scale)]
+
+
+def narrower(problem: Problem, effect: Effect) -> list[Effect]:
+    """The law of the catalogue that a wider form of the same name holds: beside what was missing it may do as well."""
+    h = effect.hypothesis
+    if "narrow" not in h.options:
+        return []
+    plain = (
+        x
+        for x in catalogue(problem.structure, motions_alone=problem.motions_alone)
+        if x.key == h.key and "holds" not in x.options and x.options.get("turns") == h.options.get("turns")
+    )
+    return [Effect(x, clip_to_bounds(x, h.options["narrow"](effect.p))) for x in plain][:1]
 
 
 def wider_laws(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:

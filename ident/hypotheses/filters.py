@@ -45,5 +45,6 @@ def form(effect: str, stepped: bool, second: bool) -> tuple[tuple[Parameter, ...
             leave more than noise.
     """
     if second:
-        return (SQUARE,), second_order_lag, {"filter": second_order_lag, "holds": effect, "widens": _from_late}
+        options = {"holds": effect, "widens": _from_late, "narrow": lambda p: np.array([p[0], 0.0])}
+        return (SQUARE,), second_order_lag, {"filter": second_order_lag} | options
     return sought(STEPPED, stepped)[0], lag, {"filter": lag}

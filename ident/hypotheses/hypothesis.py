@@ -143,7 +143,8 @@ class Hypothesis:
             to start from where no linear step leads there. ``absorbs`` names an effect that this one
             holds as a special case, ``absorb(p, weights, old)`` gives its start where it takes the
             place of one with parameters ``old`` at the same joint, ``widens(old, scale)`` starts to try of other
-            shapes. ``holds`` names one that it holds and is asked for beside alone (``wider_forms``), from ``widens`` too.
+            shapes. ``holds`` names one that it holds and is asked for beside alone (``wider_forms``), from ``widens`` too,
+            and ``narrow(p)`` gives parameters of the law of its own name that it holds.
             ``called(p, swing)``: name, and names of parameters, of the special case that it is as good as at a joint that
             swings so far; None where it is not. ``apart``: the parameter that sets it apart from that special case, and ``special(p)`` the
             parameters of the special case that it is where the data do not show this one, or where ``give(p)``, rad, is

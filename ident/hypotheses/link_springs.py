@@ -96,6 +96,7 @@ def spring_between_points(joint: int, place: str) -> Hypothesis:
             "slope": slope,
             "holds": "gravity_spring",
             "widens": lambda p, scale: [np.array([*p[:2], CONSTANT.center, STRETCH.center])],
+            "narrow": lambda p: p[:2],
         },
     )
 
@@ -179,5 +180,5 @@ def hung_dress_pack(joint: int, place: str, spring: bool) -> Hypothesis:
         return [np.array([p[0], share * p[0] * scale.q, TURNS * scale.v, 0.0, p[1]]) for share in RUBS]
 
     plain = dress_pack(joint, place, hung=True)
-    own = {"holds": "gravity_spring" if spring else "dress_pack", "widens": widens}
+    own = {"holds": "gravity_spring" if spring else "dress_pack", "widens": widens, "narrow": lambda p: p[:4]}
     return replace(plain, options=plain.options | own)

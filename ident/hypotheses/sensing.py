@@ -108,7 +108,11 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0, oval: bool 
         )
 
     second = SECOND if oval else ()
-    wide = {"holds": "encoder_eccentricity", "widens": lambda p, scale: [np.array([*p[:2], 0.0, 0.0])]}
+    wide = {
+        "holds": "encoder_eccentricity",
+        "widens": lambda p, scale: [np.array([*p[:2], 0.0, 0.0])],
+        "narrow": lambda p: p[:2],
+    }
     return Hypothesis(
         "encoder_eccentricity",
         place,

@@ -13,7 +13,7 @@ from scipy.special import ndtri
 
 from ident.hypotheses.friction import RELAXATION, presliding_friction, rate_of
 from ident.hypotheses.hypothesis import Hypothesis, Parameter
-from ident.hypotheses.yielding import elastoplastic
+from ident.hypotheses.yielding import DAHL, elastoplastic
 from ident.motion import Motion
 
 SLIPS = 10
@@ -43,6 +43,7 @@ def slipping_friction(joint: int, place: str) -> Hypothesis:
     own = {
         "holds": "presliding_friction",
         "widens": lambda p, scale: [np.array([p[0], p[1], spread, p[3]]) for spread in SPREADS],
+        "narrow": lambda p: np.array([p[0], p[1], DAHL, p[3]]),
     }
     return replace(
         plain,
