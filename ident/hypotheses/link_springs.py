@@ -92,6 +92,8 @@ def spring_between_points(joint: int, place: str) -> Hypothesis:
         parameters=(stiffness, replace(rest, lower=-2.0 * np.pi, upper=2.0 * np.pi), CONSTANT, STRETCH),
         law=law,
         screen=screen,
+        sentence="A spring between two points, of {stiffness:.3g} N m/rad about its rest at {rest_angle:.3g} rad, pulls on the"
+        " link of {joint}: static torque that depends on the posture.",
         options={
             "slope": slope,
             "holds": "gravity_spring",
