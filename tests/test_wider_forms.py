@@ -76,10 +76,8 @@ def filtered(segment, channel, change):
     return replace(segment, **{channel: x})
 
 
-@pytest.mark.parametrize(("effect", "channel", "square"), [
-    ("torque_lag", "tau", 0.4),
-    pytest.param("sensor_lag", "q", 0.25, marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "channel", "square"), [("torque_lag", "tau", 0.4), ("sensor_lag", "q", 0.25)])
 def test_a_lag_of_second_order_is_one_cause(locked, tmp_path, effect, channel, square):
     """Not a delay with a lag beside it."""
     data = quick_experiment(small_plan(locked, 3), seed=3)
