@@ -63,13 +63,7 @@ from ident.trust import (
     within_steps,
 )
 from ident.units import linear_names, unit_at
-from ident.values import (
-    baseline_values,
-    extended_baseline,
-    inertia_values,
-    named_effects,
-    reported_parameters,
-)
+from ident.values import baseline_values, extended_baseline, inertia_values, named_effects, reported_parameters
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
@@ -194,8 +188,8 @@ def cause_remains(found: Findings, refuted: bool) -> bool:
 
 def no_loads(found: Findings) -> list[Effect]:
     """Loads that no arm could carry (``trust.unlike_a_load``)."""
-    loads = [e for e in named_effects(found.final) if e.hypothesis.effect == "payload"]
-    return [e for e in loads if unlike_a_load(e, found.final, found.final.covariance())]
+    covariance = found.final.covariance()
+    return [e for e in named_effects(found.final) if unlike_a_load(e, found.final, covariance)]
 
 
 def named_causes(found: Findings, refuted: bool) -> Iterator[Cause]:

@@ -212,12 +212,12 @@ def narrower(problem: Problem, effect: Effect) -> list[Effect]:
     h = effect.hypothesis
     if "narrow" not in h.options:
         return []
-    plain = (
+    plain = next(
         x
         for x in catalogue(problem.structure, motions_alone=problem.motions_alone)
         if x.key == h.key and "holds" not in x.options and x.options.get("turns") == h.options.get("turns")
     )
-    return [Effect(x, clip_to_bounds(x, h.options["narrow"](effect.p))) for x in plain][:1]
+    return [Effect(plain, clip_to_bounds(plain, h.options["narrow"](effect.p)))]
 
 
 def wider_laws(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:

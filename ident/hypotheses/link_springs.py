@@ -125,8 +125,7 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False,
 
         def start(c):
             turns = (give, 0.0) if yields else (turn, *shape)
-            hangs = (0.0 for _ in rest)
-            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *turns, *hangs]) if max(c[0], c[1]) > 0 else None
+            return np.array([max(c[0], 1e-3), max(c[1], 1e-3), *turns]) if max(c[0], c[1]) > 0 else None
 
         if not yields:
             return Screen((q, direction(v, turn)), start, shape)
@@ -183,4 +182,4 @@ def hung_dress_pack(joint: int, place: str, spring: bool) -> Hypothesis:
 
     plain = dress_pack(joint, place, hung=True)
     own = {"holds": "gravity_spring" if spring else "dress_pack", "widens": widens, "narrow": lambda p: p[:4]}
-    return replace(plain, options=plain.options | own)
+    return replace(plain, screen=None, options=plain.options | own)

@@ -104,10 +104,9 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0, oval: bool 
         sine, cosine = np.sin(q), np.cos(q)
         return Screen(
             (-motion.lines(sine) - np.mean(cosine) * unseen, -motion.lines(cosine) + np.mean(sine) * unseen),
-            lambda c: np.array([*c, *(0.0 for _ in second)]),
+            lambda c: np.array(c),
         )
 
-    second = SECOND if oval else ()
     wide = {
         "holds": "encoder_eccentricity",
         "widens": lambda p, scale: [np.array([*p[:2], 0.0, 0.0])],
@@ -121,11 +120,11 @@ def encoder_eccentricity(joint: int, place: str, turns: float = 1.0, oval: bool 
         (
             Parameter("sine", "rad", -0.2, 0.2, step=1e-6),
             Parameter("cosine", "rad", -0.2, 0.2, step=1e-6),
-            *second,
+            *(SECOND if oval else ()),
         ),
         law,
         lambda scale: [()],
-        screen,
+        None if oval else screen,
         "The encoder of {joint} errs by {amplitude:.3g} rad once a turn of "
         + ("its motor." if turns != 1.0 else "the joint."),
         variable="q",

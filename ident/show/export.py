@@ -361,8 +361,7 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
     elif cause.effect == "torque_constant":
         drive.gear = [drive.gear[0] * p["scale"], 0, 0, 0, 0, 0]
     elif cause.effect == "torque_delay":
-        lead = 0.0 if drive.delay else stage_lead(step, spec.option.integrator)
-        _add_delay(drive, p["delay"] + lead, step)
+        _add_delay(drive, p["delay"], spec.option)
     elif cause.effect == "torque_lag":
         lag, late = lag_and_delay(p)
         if lag > 0.0:
@@ -370,7 +369,7 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
             drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT if exact else mujoco.mjtDyn.mjDYN_FILTER
             drive.dynprm = [lag + min(late, 0.0), *([0] * (len(drive.dynprm) - 1))]
         if late > 0.0:
-            _add_delay(drive, late + (0.0 if drive.delay else stage_lead(step, spec.option.integrator)), step)
+            _add_delay(drive, late, spec.option)
     elif cause.effect == "torque_saturation":
         drive.forcelimited, drive.forcerange = True, [-p["limit"], p["limit"]]
     elif cause.effect == "hardening_stiffness":
@@ -400,10 +399,11 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         sensor.nsample = int(np.ceil(p["delay"] / step)) + 2
 
 
-def _add_delay(drive: mujoco.MjsActuator, delay: float, step: float) -> None:
-    """A delay of a torque, s, linear between past steps: over one in which the input changes it delivers the mean."""
-    drive.delay += delay
-    drive.interp, drive.nsample = 1, int(np.ceil(drive.delay / step)) + 2
+def _add_delay(drive: mujoco.MjsActuator, delay: float, option: mujoco.MjOption) -> None:
+    """A delay of a torque, s, linear between past steps: over one in which the input changes it delivers the mean. The
+    first of a drive makes up for what its stages see ahead."""
+    drive.delay += delay + (0.0 if drive.delay else stage_lead(option.timestep, option.integrator))
+    drive.interp, drive.nsample = 1, int(np.ceil(drive.delay / option.timestep)) + 2
 
 
 def _add_friction(joint: mujoco.MjsJoint, torque: float, step: float, lead: float = 0.0) -> None:
