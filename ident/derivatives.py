@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from ident.errors_in_variables import impedance_slopes, scatter_information, sca
 from ident.extended import Prediction, of_channel, predict, predict_at, through_drives
 from ident.group import Group
 from ident.inverse import Plane, baseline_products
-from ident.model import Effect, Model, joints_along_record
+from ident.model import Effect, Model, is_dry, joints_along_record
 from ident.motion import Motion
 from ident.parallel import map_threads
 from ident.posture import moved_by_posture
@@ -42,9 +42,7 @@ def jacobian(
     motion = group.window is not None
     # Along a motion softer gears move gravity and inertia too; link encoders show the links themselves.
     sway = range(model.structure.n) if motion and not group.links else ()
-    remade = pred
-    if exact or sway or any(moves_geometry(e, motion) for e in model.effects):
-        remade = _again(problem, model, group, pred, 1)
+    near = _Near(problem, model, group, pred)
     posture = moved_by_posture(pred)[:, :top] if shifts and not exact and not motion else None
     n, base = model.structure.n, _baseline(model, pred, pred.plane, top)
     late = np.zeros((len(pred.U), top, n + len(group.links)), complex)
@@ -53,14 +51,10 @@ def jacobian(
     if posture is not None:
         baseline = baseline.replaced(_sagging(baseline, pred, posture))
     baseline = baseline.replaced(_passed_on(baseline, model, pred))
-    baseline = baseline.replaced(_differences(problem, model, group, pred, remade, sway, exact, posture))
+    baseline = baseline.replaced(_differences(near, sway, exact, posture))
     if not problem.free_timing:
         baseline.whole[..., baseline.whole_at == m] = 0.0
-    effects = [
-        column
-        for i in range(len(model.effects))
-        for column in _effect_columns(problem, model, group, pred, remade, i, exact, posture)
-    ]
+    effects = [column for i in range(len(model.effects)) for column in _effect_columns(near, i, exact, posture)]
     columns = baseline.replaced({m + 1 + i: column for i, column in enumerate(effects)})
     still = held(pred, group)
     if still is None:
@@ -82,9 +76,47 @@ def _baseline(model: Model, pred: Prediction, plane: Plane, top: int) -> Product
     return baseline_products(pred.structure, pred.par, plane, pred.solution, top).pick(keep)
 
 
-def _again(problem: Problem, model: Model, group: Group, pred: Prediction, steps: int) -> Prediction:
-    """What a model near that of ``pred`` predicts, from its geometric remainder, ``steps`` on, and its torques."""
-    return predict(model, group, problem.sampling, W=pred.solution.W, steps=steps, torques=pred.solution.torques)
+@dataclass(frozen=True)
+class _Near:
+    """Differences of predictions to those of models near by, from the geometric remainder and torques of ``pred``."""
+
+    problem: Problem
+    model: Model
+    group: Group
+    pred: Prediction
+
+    def again(self, model: Model, steps: int) -> Prediction:
+        """What a model near by predicts, with the geometric remainder ``steps`` on."""
+        W, torques = self.pred.solution.W, self.pred.solution.torques
+        return predict(model, self.group, self.problem.sampling, W=W, steps=steps, torques=torques)
+
+    @cached_property
+    def remade(self) -> Prediction:
+        """The model itself, with the remainder one step on."""
+        return self.again(self.model, 1)
+
+    @cached_property
+    def remade_bare(self) -> Prediction:
+        """The same ``without_friction``."""
+        return self.again(without_friction(self.model, self.group), 1)
+
+    def change_of_links(self, there: Model) -> np.ndarray:
+        """(S, K, n + M) change of the compared outputs, one step on, to a model whose links move otherwise along the
+        same motion of the motors."""
+        return _change(self.group, self.again(without_friction(there, self.group), 1), self.remade_bare, None)
+
+
+def without_friction(model: Model, group: Group) -> Model:
+    """A model without dry friction that only the motion of its motor moves.
+
+    What moves the links changes that at rest alone, where ``stiction.held`` says so; elsewhere it is in both sides of a
+    difference, and takes most of the time.
+    """
+    if joints_along_record(model, group):
+        return model  # what is at the motor tells the deflection
+    laws = [e.hypothesis for e in model.effects]
+    moved = {h.joint for h in laws if h.channel == "drive" or h.options.get("sees_load")}
+    return replace(model, effects=tuple(e for e in model.effects if not is_dry(e) or e.hypothesis.joint in moved))
 
 
 def _sagging(columns: Columns, pred: Prediction, posture: np.ndarray) -> dict[int, np.ndarray]:
@@ -112,16 +144,7 @@ def _change(group: Group, there: Prediction, base: Prediction, posture: np.ndarr
     return change + np.einsum("slon,sn->slo", posture, shift)
 
 
-def _differences(
-    problem: Problem,
-    model: Model,
-    group: Group,
-    pred: Prediction,
-    remade: Prediction,
-    sway: Iterable[int],
-    exact: bool,
-    posture: np.ndarray | None,
-) -> dict[int, np.ndarray]:
+def _differences(near: _Near, sway: Iterable[int], exact: bool, posture: np.ndarray | None) -> dict[int, np.ndarray]:
     """Baseline columns (S, L, n + M) of what moves laws of the gear, or with ``exact`` and along motions the links, by
     differences.
 
@@ -129,11 +152,11 @@ def _differences(
     the motor takes of that, and with the timing.
 
     Args:
-        remade: ``pred`` with its geometric remainder one step on, where anything is told by its change.
         sway: coordinates that move the links along a motion.
     """
+    model = near.model
     n, m = model.structure.n, len(model.par.to_log())
-    along = joints_along_record(model, group)
+    along = joints_along_record(model, near.group)
     gears = {e.hypothesis.joint for e in model.effects if e.hypothesis.gear_law}
     steps = {f * n + j: BASELINE_STEP for j in gears for f in range(4 if j in along else 2)}
     anew = set(np.flatnonzero(moves_links(model)[:m]).tolist() if exact else sway)
@@ -144,10 +167,10 @@ def _differences(
 
     def column(c: int, step: float) -> np.ndarray:
         there = unpack(model, x + step * (np.arange(len(x)) == c), np.inf)
-        again = exact or c in anew
-        return (
-            _change(group, _again(problem, there, group, pred, int(again)), remade if again else pred, posture) / step
-        )
+        if c in anew:
+            return near.change_of_links(there) / step
+        base = near.remade if exact else near.pred
+        return _change(near.group, near.again(there, int(exact)), base, posture) / step
 
     return {c: column(c, step) for c, step in steps.items()}
 
@@ -173,43 +196,23 @@ def _change_passed(drive: Effect, motion: Motion, X: np.ndarray) -> np.ndarray:
     return h.law(drive.p, motion, h.joint, k, X) - h.law(drive.p, motion, h.joint, k, 0 * X)
 
 
-def _effect_columns(
-    problem: Problem,
-    model: Model,
-    group: Group,
-    pred: Prediction,
-    remade: Prediction,
-    i: int,
-    exact: bool,
-    posture: np.ndarray | None,
-) -> list[np.ndarray]:
+def _effect_columns(near: _Near, i: int, exact: bool, posture: np.ndarray | None) -> list[np.ndarray]:
     """Derivatives (S, K, n + M) of the predicted outputs by the coordinates of effect ``i``: none by those that the
-    group does not feel.
-
-    Args:
-        remade: as of ``_differences``.
-    """
-    effect = model.effects[i]
+    group does not feel."""
+    model, group, effect = near.model, near.group, near.model.effects[i]
     felt = [group.window is not None or not q.at_start for q in effect.hypothesis.parameters]
     steps = [s for s, f in zip(model.stepped[i], felt, strict=True) if f]
-    columns = iter(_effect_differences(problem, model, group, pred, remade, i, steps, exact, posture))
-    none = np.zeros((len(pred.U), compared_lines(group), model.structure.n + len(group.links)), complex)
+    columns = iter(_effect_differences(near, i, steps, exact, posture))
+    none = np.zeros((len(near.pred.U), compared_lines(group), model.structure.n + len(group.links)), complex)
     return [next(columns) if f else none for f in felt]
 
 
 def _effect_differences(
-    problem: Problem,
-    model: Model,
-    group: Group,
-    pred: Prediction,
-    remade: Prediction,
-    i: int,
-    steps: Sequence[tuple[Model, float]],
-    exact: bool,
-    posture: np.ndarray | None,
+    near: _Near, i: int, steps: Sequence[tuple[Model, float]], exact: bool, posture: np.ndarray | None
 ) -> list[np.ndarray]:
     """Change (S, K, n + M) of the predicted outputs by each of some ``steps`` of effect ``i``, over its size; else as
     ``_effect_columns``."""
+    model, group, pred = near.model, near.group, near.pred
     effect, top = model.effects[i], compared_lines(group)
     h, moves = effect.hypothesis, [(there.effects[i].p, step) for there, step in steps]
     if h.channel == "motor" and not joints_along_record(model, group):
@@ -217,13 +220,15 @@ def _effect_differences(
     if h.channel == "drive":
         return [column[:, :top] for column in _drive_columns(model, group, pred, effect, moves)]
     if exact or moves_geometry(effect, group.window is not None):
-        base, posture = remade, None
-        moved = [_again(problem, there, group, pred, 1) for there, _ in steps]
+        if h.channel != "position":
+            return [near.change_of_links(there) / step for there, step in steps]
+        base, posture = near.remade, None
+        moved = [near.again(there, 1) for there, _ in steps]
     else:
         base = pred
         held: dict[str, Any] = {"W": pred.solution.W, "torques": pred.solution.torques}
         moved = [
-            predict_at(there, pred.structure, pred.par, pred.plane, group, problem.sampling, **held)
+            predict_at(there, pred.structure, pred.par, pred.plane, group, near.problem.sampling, **held)
             for there, _ in steps
         ]
     return [_change(group, there, base, posture) / step for there, (_, step) in zip(moved, steps, strict=True)]

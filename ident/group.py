@@ -204,6 +204,11 @@ class Group:
         return self.slow_velocity if self.fast_velocity is None else self.slow_velocity + self.fast_velocity
 
     @cached_property
+    def velocity_of(self) -> np.ndarray:
+        """(n, S, n_time) the same by motor."""
+        return np.ascontiguousarray(np.moveaxis(self.velocity, -1, 0))
+
+    @cached_property
     def torque_share(self) -> np.ndarray:
         """(S, L, n) the same of the torque: a law that clips it would clip its noise, and so explain that."""
         return signal_share(self.U, self.torque_noise)

@@ -161,8 +161,10 @@ def plane_at(structure: Structure, par: Parameters, lin: Linearisation, group: G
 def true_position(
     group: Group, par: Parameters, sampling: Sampling, passed: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> np.ndarray:
-    """Motor position without what the images of the held torque add; (S, L, n) rad. ``passed`` as of
-    ``alias_response``."""
+    """Motor position without what the images of the held torque add; (S, L, n) rad, that of the group itself where none
+    is held. ``passed`` as of ``alias_response``."""
+    if sampling.hold == "none":
+        return group.Q
     alias = alias_response(group.omega, sampling.sample_time, sampling.hold, passed).reshape(len(group.omega), -1)
     return group.Q - alias * group.U / par.inertia
 

@@ -139,6 +139,8 @@ class Motion(Recorded):
 
     def v(self, joint: int) -> np.ndarray:
         """Motor velocity without lines of noise alone, rad/s."""
+        if self.solution.Q is self.group.Q and not isinstance(self.error, np.ndarray):
+            return self.group.velocity_of[joint]
         fast = 0.0 if self.group.fast_velocity is None else self.group.fast_velocity[..., joint]
         return self.kept(("v", joint), lambda: self._shown(joint, 1) + fast)
 

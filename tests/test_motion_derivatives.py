@@ -59,6 +59,25 @@ def test_softer_gears_move_gravity_and_inertia(moving):
         assert np.linalg.norm(group.observe(J[..., j]) - slope) < 0.03 * np.linalg.norm(slope)
 
 
+@pytest.mark.parametrize("effect", ["coulomb_friction", "load_dependent_friction"])
+def test_what_moves_the_links_moves_friction_by_its_load_alone(moving, effect):
+    """Differences leave out friction that sees its motor alone, and keep what grows with the load."""
+    problem, model, _ = moving
+    laws = [h for h in catalogue(problem.structure, motions_alone=True) if h.effect == effect]
+    sizes = {"coulomb_friction": [20.0, 0.1, 1e-3], "load_dependent_friction": [0.3, 1e-3]}[effect]
+    payload = next(h for h in catalogue(problem.structure) if h.effect == "payload")
+    load = Effect(payload, payload.options["start"](np.array([2.0, 0.1, 0.0, 0.2])))
+    full = replace(model, effects=(*(Effect(h, np.array(sizes)) for h in laws), load))
+    (pred,) = predictions(problem, full, [None], steps=None)
+    group, x = problem.groups[0], pack(full)
+    J = group.observe_outputs(jacobian(problem, full, group, pred).dense())
+    for c in (0, 1, 2, len(x) - 7):  # gears, and the mass
+        step = 1e-3 * (np.arange(len(x)) == c)
+        ends = [anew(problem, unpack(full, x + sign * step, np.inf), pred) for sign in (1.0, -1.0)]
+        slope = group.observe((ends[0] - ends[1]) / 2e-3)
+        assert np.linalg.norm(J[..., c] - slope) < 0.03 * np.linalg.norm(slope)
+
+
 @pytest.fixture(scope="module")
 def yielding(moving):
     """The problem as recorded with an element in a gear that yields and holds 0.6 of its limit where the motion begins,

@@ -426,7 +426,7 @@ def load_dependent_friction(joint: int, place: str, leads: bool = True) -> Hypot
         screen,
         "The friction torque of {joint} is {coefficient:.3g} of the torque it transmits: it differs"
         " between postures as the load does.",
-        options={"dry": True, "shown": "coefficient"},
+        options={"dry": True, "sees_load": True, "shown": "coefficient"},
     )
 
 

@@ -152,7 +152,8 @@ class Hypothesis:
             of the effect, ``trivial(p, stiffness)`` says so of all parameters together, beside a gear of that
             stiffness. ``bends``: the arm may have several steady motions with it; ``bends(p, factor, stiffness)`` gives
             parameters of another size that do
-            about the same. ``dry``: a friction that at rest balances what is asked of it.
+            about the same. ``dry``: a friction that at rest balances what is asked of it; ``sees_load``: of a size that
+            the torque of the gear says.
             ``nats(p)``: log odds before the data, where there is a reason for any. ``of_size(p)``: factor of the spreads
             that are expected of its parameters. ``body``: the link whose inertia it
             changes.
