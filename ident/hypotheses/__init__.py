@@ -104,10 +104,12 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
         for with_load in (False, True)[: 1 + loaded]:
             out.append(bodies.link_inertia(link, _joint_of_body(chain, index), carries, with_load))
     for j, name in enumerate(names):
-        # Before the first joint it would be the base that moves.
-        for before in (False, True)[: 1 + (j > 0)]:
+        on_base, off_origin = _on_base(chain, j)
+        # At the origin of the base it would be the base that moves.
+        for before in (False, True)[: 1 + (off_origin or not on_base)]:
             out += [
-                hinges.compliance(name, j, axes, "transverse_elasticity", before) for axes in _turned(_across(chain, j))
+                hinges.compliance(name, j, axes, "transverse_elasticity", before, before and on_base)
+                for axes in _turned(_across(chain, j))
             ]
     if robot.n > 1 and np.any(robot.gravity):  # of a single joint it is a body whose centre is elsewhere
         out.append(structure.leaning_base())
@@ -152,10 +154,20 @@ def _joint_of_body(chain: Structure, index: int) -> int:
     return below[-1] if below else -1
 
 
+def _index(chain: Structure, joint: int) -> int:
+    """Pinocchio's index of a driven joint."""
+    return next(i for i in range(1, chain.model.njoints) if chain.model.idx_vs[i] == chain.driven[joint])
+
+
+def _on_base(chain: Structure, joint: int) -> tuple[bool, bool]:
+    """Whether a joint is carried by the base, and whether off its origin."""
+    index = _index(chain, joint)
+    return chain.model.parents[index] == 0, bool(np.any(chain.model.jointPlacements[index].translation))
+
+
 def _across(chain: Structure, joint: int) -> np.ndarray:
     """(2, 3) axes of the joint's frame, across its own."""
-    index = next(i for i in range(1, chain.model.njoints) if chain.model.idx_vs[i] == chain.driven[joint])
-    own = np.asarray(chain.model.joints[index].extract().axis)
+    own = np.asarray(chain.model.joints[_index(chain, joint)].extract().axis)
     axes = np.stack(sorted(np.eye(3), key=lambda a: abs(a @ own))[:2])
     axes = axes - np.outer(axes @ own, own) / (own @ own)
     return axes / np.linalg.norm(axes, axis=1, keepdims=True)

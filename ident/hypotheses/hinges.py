@@ -18,16 +18,22 @@ STIFFEST = 1e12  # N m/rad, of a hinge
 RESONANCES = 0.06, 0.12, 0.22, 0.35, 0.55, 0.85, 5.0  # of a hinge, over the highest line: far above it all answer alike
 # of an elastic axis towards each other axis, in units of that along the one from which it is sought in a fit
 MOST_TILT = 3.0
+ON_BASE_NATS = 2.5  # against a hinge between base and first joint: of what bends there most is the foundation
 
 
 def compliance(
-    place: str, joint_index: int, axes: tuple[tuple[float, float, float], ...], effect: str, before: bool = False
+    place: str,
+    joint_index: int,
+    axes: tuple[tuple[float, float, float], ...],
+    effect: str,
+    before: bool = False,
+    on_base: bool = False,
 ) -> Hypothesis:
     """A spring-damper hinge across a joint (or under the base) that the model lacks.
 
     Args:
         axes: the one from which the axis is sought, and those towards which it may turn.
-        before: hinge before the joint, at the end of the body that carries it.
+        before: hinge before the joint, at the end of the body that carries it; ``on_base``: which is the base.
     """
     name = f"{effect}:{place}"
     tilts = tuple(f"tilt_{i}" for i in range(1, len(axes)))
@@ -41,11 +47,8 @@ def compliance(
         along = np.concatenate([[1.0], np.asarray(p)[2:]])
         i = int(np.argmax(np.abs(along)))
         others = np.roll(along, -i)[1:] / along[i]
-        return (
-            (compliance(place, joint_index, (*axes[i:], *axes[:i]), effect, before), np.array([*p[:2], *others]))
-            if i
-            else None
-        )
+        turned = compliance(place, joint_index, (*axes[i:], *axes[:i]), effect, before, on_base)
+        return (turned, np.array([*p[:2], *others])) if i else None
 
     def hinge(p: Sequence[float]) -> Elasticity:
         x, y, z = (float(v) for v in axis(p))
@@ -93,6 +96,7 @@ def compliance(
             "axis": axis,
             "nearer": nearer,
             "before": before,
+            "nats": lambda p: -ON_BASE_NATS * on_base,
             "trivial": lambda p, k: p[0] > 0.1 * STIFFEST,
         },
     )
