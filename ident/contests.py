@@ -13,7 +13,7 @@ from ident.hypotheses.hypothesis import RIPPLE
 from ident.model import Effect
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
-from ident.pruning import pruned, untold
+from ident.pruning import plainly_special, pruned, untold
 from ident.refits import (
     FINALISTS,
     FIRST_STEPS,
@@ -111,7 +111,7 @@ def contest(problem: Problem, current: Fit, found: Round, workers: Workers) -> t
     first = ran[0].fit
     kept = best_of_each(ran)
     names = {c.hypothesis.key for c in kept}
-    ran = [c for c in kept if c.hypothesis is own.hypothesis or not same_as_special(c, names)]
+    ran = [c for c in kept if c.hypothesis is own.hypothesis or not same_as_special(problem, c, names)]
     excess = errors_by_joint(min((c.fit for c in ran), key=lambda r: r.cost).costs, current.counts, found.fall)
     weighed = weigh(ran, excess, found.falls, temper_of(found.before))
     best = weighed[0]
@@ -148,11 +148,13 @@ def in_reach(ran: Sequence[Candidate]) -> list[Candidate]:
     return [c for i, c in enumerate(ran) if i == 0 or c.fit.cost - best.cost <= left]
 
 
-def same_as_special(candidate: Candidate, ran: Collection[tuple[str, str]]) -> bool:
+def same_as_special(problem: Problem, candidate: Candidate, ran: Collection[tuple[str, str]]) -> bool:
     """Whether a candidate is but the special case that it holds, which ran too: a cable that does not rub beside a
     spring."""
-    h = candidate.hypothesis
-    return (h.options.get("absorbs"), h.place) in ran and untold(candidate.fit, candidate.fit.model.effects[-1])
+    h, model = candidate.hypothesis, candidate.fit.model
+    return (h.options.get("absorbs"), h.place) in ran and (
+        untold(candidate.fit, model.effects[-1]) or plainly_special(problem, model, model.effects[-1])
+    )
 
 
 def alike(found: Round, winner: Hypothesis) -> list[Effect]:

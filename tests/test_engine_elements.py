@@ -12,7 +12,7 @@ from ident.diagnosis import diagnose
 from ident.hypotheses import catalogue
 from ident.hypotheses.friction import dry
 from ident.model import Effect
-from ident.pruning import LED, leads_by, plainly_special
+from ident.pruning import LED, plainly_special, turns_within
 from sim.effects.structure import add_spring
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -166,8 +166,9 @@ def test_a_friction_that_is_a_soft_constraint_is_named_and_measured(locked, tmp_
     assert verdict.unexplained_verdict == "noise floor reached"
 
 
-def test_a_dip_within_velocities_by_which_a_friction_leads_is_none(identified):
-    """There a soft constraint takes what is asked of it, whatever its size."""
+def test_a_dip_within_velocities_that_pass_in_a_sample_or_by_which_a_friction_leads_is_none(identified):
+    """Between samples nothing tells its size, and a soft constraint takes what is asked of it there, whatever that
+    is."""
     _, setup, result = identified
     dip = next(
         h
@@ -178,10 +179,15 @@ def test_a_dip_within_velocities_by_which_a_friction_leads_is_none(identified):
     def special(width, lead):
         return plainly_special(setup.problem, result.model, Effect(dip, np.array([2.0, 4.0, width, 1e-3, 2.0, lead])))
 
-    led = leads_by(setup.problem, Effect(dip, np.array([2.0, 4.0, 0.1, 1e-3, 2.0, 2e-3])))
+    sample = setup.problem.sampling.sample_time
+    lead = 4.0 * sample
+    led, sampled = (
+        turns_within(setup.problem, Effect(dip, np.array([2.0, 4.0, 0.1, 1e-3, 2.0, x]))) for x in (lead, 0)
+    )
     accelerations = [
         np.sqrt(np.mean(g.to_time(-(g.omega[:, None] ** 2) * g.Q)[..., dip.joint] ** 2)) for g in setup.problem.groups
     ]
-    assert led == pytest.approx([2e-3 * a for a in accelerations], rel=1e-6)
-    assert special(0.5 * LED * min(led), 2e-3)
-    assert not special(2.0 * LED * max(led), 2e-3) and not special(0.5 * LED * min(led), 0.0)
+    assert led == pytest.approx([lead * a for a in accelerations], rel=1e-6)
+    assert sampled == pytest.approx([sample * a for a in accelerations], rel=1e-6)
+    assert special(0.5 * LED * min(led), lead) and special(0.5 * LED * min(sampled), 0.0)
+    assert not special(2.0 * LED * max(led), lead) and not special(2.0 * LED * max(sampled), 0.0)

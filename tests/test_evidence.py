@@ -1842,7 +1842,7 @@ def test_a_cable_that_does_not_rub_is_the_spring_that_it_holds(identified, named
     fitted = refit(setup.problem, model, result.weights, result.remainders, 1)
     cable = Candidate(fitted.model.effects[-1].hypothesis, fitted, 0.0)
     spring = named["gravity_spring", "elbow_joint"].key
-    assert same_as_special(cable, {spring: cable}) and not same_as_special(cable, {})
+    assert same_as_special(setup.problem, cable, {spring}) and not same_as_special(setup.problem, cable, set())
 
 
 def test_a_body_with_its_load_and_without_stay_in_a_contest():
