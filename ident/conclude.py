@@ -31,6 +31,7 @@ from ident.notes import (
     load_note,
     lost_note,
     nameless_note,
+    noise_note,
     record_note,
     roll_off_note,
     sentence,
@@ -39,6 +40,7 @@ from ident.notes import (
     tone_note,
 )
 from ident.quantization import Steps
+from ident.recorded_noise import given_noise
 from ident.reporting import where
 from ident.rigid import RigidFit
 from ident.rounds import Round
@@ -297,6 +299,9 @@ def notes_on(found: Findings, causes: Sequence[Cause], tones: Sequence[Tone], de
         )
     if problem.steps is not None:
         yield step_note(problem.steps)
+    given = given_noise(found.dataset, "tau")
+    if given is not None:
+        yield from noise_note(problem, given)
     if problem.sampling.roll_off:
         yield roll_off_note(problem)
     if problem.sampling.late_excitation:

@@ -29,7 +29,13 @@ from ident.noise import (
 from ident.parallel import one_thread_each
 from ident.problem import Problem, data_count, output_error, predictions
 from ident.quantization import Steps, find_steps, with_rounding
-from ident.recorded_noise import declared_position_noise, given_noise, least_noise, noise_of, recorded_noise
+from ident.recorded_noise import (
+    declared_position_noise,
+    given_noise,
+    least_noise,
+    noise_of,
+    recorded_noise,
+)
 from ident.records import build_groups, with_turns_alike
 from ident.refits import under_own_noise
 from ident.roll_off import with_roll_off
@@ -44,6 +50,8 @@ POSTURES = 8  # of a motion at which modes are looked at
 RENEWALS = 3  # at most, of such noise
 LOUD = 2.0  # power of noise as it was guessed, over that which is found, from which it is lowered
 SLOW_LINES = 2.0  # power left at all lines of motions over that at the fast ones, up to which both are noise
+# power of noise beyond that which is given at the joint that has most, over that where it is least; and joints
+ALIKE, FEWEST_ALIKE = 2.0, 3
 RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
 
 
@@ -317,17 +325,20 @@ def left_at_lines(problem: Problem, result: Fit) -> tuple[list[np.ndarray], list
 
 
 def with_noise_of_fast_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
-    """Noise of the torque in motions that was guessed, raised to what a fit leaves in the upper half of the compared
-    band, where it leaves hardly more below.
+    """Noise of the torque in motions raised to what a fit leaves in the upper half of the compared band, where it leaves
+    hardly more below.
 
-    Noise of which neighbouring samples go together is more there than their differences say, at most joints. What a
-    model lacks follows the motion, and shows most at the slow lines of it, at some joint.
+    Noise of which neighbouring samples go together is more there than their differences, or its size, say, at most
+    joints. What a model lacks follows the motion, and shows most at the slow lines of it, at some joint. Noise that is
+    given is denied only by about as much of it at all joints.
     """
-    n = problem.structure.n
-    if not problem.motions_alone or not guessed_noise(dataset)[1] or n == 1:  # a single joint has no others beside it
+    n, guessed = problem.structure.n, guessed_noise(dataset)[1]
+    if not problem.motions_alone or n < (2 if guessed else FEWEST_ALIKE):  # no others to compare a joint with
         return problem
     whole, torque = power_at_fast_lines(*left_at_lines(problem, result))
     if np.any(result.costs > SLOW_LINES * whole * result.counts) or np.sum(whole > LOUD) <= n / 2:
+        return problem
+    if not guessed and not (np.all(whole > LOUD) and whole.max() < ALIKE * whole.min()):
         return problem
     return replace(problem, tau_std=problem.tau_std * np.sqrt(np.maximum(torque, 1.0)))
 

@@ -214,25 +214,31 @@ def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(
         assert reweighted(other.problem, first, own).costs == pytest.approx(first.costs, rel=0.02)
 
 
-@pytest.mark.parametrize("joints", [slice(None), slice(2, 3)])
-def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(locked, tmp_path, joints):
-    """Of all joints alike it is seen at the fast lines of motions. At one joint alone it may as well be a cause."""
+@pytest.mark.parametrize(
+    ("joints", "given"),
+    [(slice(None), False), (slice(2, 3), False), (slice(None), True), (slice(1, None), True)],
+)
+def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(locked, tmp_path, joints, given):
+    """Of all joints alike it is seen at the fast lines of motions. At one joint alone it may as well be a cause, and at
+    all but one where its size is given."""
     plan = small_plan(locked, 32, points=1, trajectory=True)
     (motion,) = plan.trajectories
     data = quick_experiment(replace(plan, experiments=(), trajectories=(motion,)), seed=32)
     data = replace(through_files(data, tmp_path), q_std=None, tau_std=None)
     (segment,) = data.segments
     steps = np.random.default_rng(5).normal(size=segment.tau.shape) * 20.0 * locked.array("tau_std")
-    coloured = scipy.signal.lfilter([1.0], [1.0, -0.9], steps, axis=0) * np.sqrt(1.0 - 0.9**2)
+    pole = 0.7 if given else 0.9
+    coloured = scipy.signal.lfilter([1.0], [1.0, -pole], steps, axis=0) * np.sqrt(1.0 - pole**2)
     tau = segment.tau.copy()
     tau[:, joints] += coloured[:, joints]
     noisy = replace(segment, name="m1", role="identification", tau=tau)
     held_out = replace(noisy, name="m2", role="validation")
-    data = replace(data, segments=(noisy, held_out))
+    tau_std = np.hypot(20.0, 1.0) * locked.array("tau_std") if given else None
+    data = replace(data, segments=(noisy, held_out), tau_std=tau_std)
     setup, first = identify(data)
     louder = with_noise_of_fast_lines(data, setup.problem, first)
     assert first.chi2_per_dof > 1.5
-    if joints == slice(2, 3):
+    if joints != slice(None):
         assert louder is setup.problem
         return
     assert np.all(louder.tau_std > setup.problem.tau_std)
