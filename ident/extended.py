@@ -13,7 +13,17 @@ from ident.graybox import Parameters, impedance, linearise
 from ident.group import Group
 from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import Hypothesis
-from ident.inverse import REMAINDER_STEPS, Plane, Sampling, make_plane, plane_at, solve, true_position
+from ident.inverse import (
+    REMAINDER_STEPS,
+    STALL_STEPS,
+    STALL_STEPS_OF_LOOPS,
+    Plane,
+    Sampling,
+    make_plane,
+    plane_at,
+    solve,
+    true_position,
+)
 from ident.model import Effect, Model, has_loop, is_along_record, is_dry, joints_along_record
 from ident.motion import Motion, Recorded, Solution, Torques
 from ident.reactions import inner_torques, motor_torques
@@ -186,7 +196,18 @@ def predict_at(
     passes = 1 if len(inner) == 1 and has_loop(inner[0]) else REACTION_STEPS
     start = torques if inner else Torques()
     solution = solve(
-        structure, par, plane, group, sampling, Q=Q, W=W, torques=start, react=react, passes=passes, steps=steps
+        structure,
+        par,
+        plane,
+        group,
+        sampling,
+        Q=Q,
+        W=W,
+        torques=start,
+        react=react,
+        passes=passes,
+        steps=steps,
+        patience=STALL_STEPS_OF_LOOPS if any(map(has_loop, inner)) else STALL_STEPS,
     )
     if motor:
         motion = Motion(group, solution, par, delivered=given, told=along)

@@ -44,7 +44,7 @@ REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends 
 # in which the change must halve: where no motion repeats the search for one does not end. Large motions of links that
 # are hardly damped take a direction of the search for each resonant line, and more than forty steps for a half.
 STALL_STEPS = 45
-STALL_STEPS_OF_LAWS = 12  # the same where each step solves laws of gears too, and takes far longer
+STALL_STEPS_OF_LOOPS = 12  # the same where each step solves laws in loops too, and takes far longer
 ROOM = 1 << 29  # bytes for past steps
 NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
 LEAST_KEPT = 0.1  # of the torque, that its record keeps of any line
@@ -222,6 +222,7 @@ def solve(
     react: Callable[[Solution], Torques] | None = None,
     passes: int = 1,
     steps: int = 0,
+    patience: int = STALL_STEPS,
 ) -> Solution:
     """Recorded motor torque that the model predicts along the measured motion.
 
@@ -233,6 +234,7 @@ def solve(
             ``torques``.
         passes: of ``react`` at most until they do; one where it is exact by itself.
         steps: fixed-point steps on the remainder, at most; a start that is near ends them sooner.
+        patience: steps in which the change must halve.
 
     Raises:
         FloatingPointError: the motion of the links runs away.
@@ -244,7 +246,6 @@ def solve(
         W, enough = static_remainder(structure, par, plane, group), REMAINDER_CHANGE
     if react is not None:
         torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-    patience = STALL_STEPS if react is None else STALL_STEPS_OF_LAWS
     left, changes = np.arange(len(W)), []
     past: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(steps):

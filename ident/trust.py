@@ -262,8 +262,12 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
         o = other.candidates[0].hypothesis
         if other is found or o.joint != h.joint or o.channel == "model" or o.decoy:
             continue
-        if o.effect == "gravity_spring" and (element(h) == "friction" or h.effect.endswith(LATE)):
-            continue  # what the law of a spring lacks follows the position, stores what it takes and is on time
+        if o.effect == "gravity_spring" and (
+            element(h) == "friction" or h.effect.endswith(LATE) or h.channel == "position"
+        ):
+            # What the law of a spring lacks follows the position, stores what it takes, is on time, and grows with no
+            # acceleration as an error of the position does.
+            continue
         least = SHADOW
         if element(o) is not None and element(o) == element(h) and not explained_by_time(found):
             least = SHADOW_OF_LAW

@@ -40,7 +40,7 @@ from ident.hypotheses.hypothesis import LOG_SPREAD, RIPPLE, Parameter
 from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import apply_change
 from ident.identification import identify
-from ident.inverse import REMAINDER_STEPS, STALL_STEPS, STALL_STEPS_OF_LAWS, plane_at, solve, stalled
+from ident.inverse import REMAINDER_STEPS, STALL_STEPS, STALL_STEPS_OF_LOOPS, plane_at, solve, stalled
 from ident.model import Effect, along_record
 from ident.naming import usual_swing
 from ident.notes import faint_note, held_out_note, load_note
@@ -310,6 +310,8 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
     assert not shadowed(rub, (spring, rub))  # what a spring lacks is no friction
     late = round_of(named["torque_delay", "elbow_joint"], 100.0, 100.0 - left)
     assert not shadowed(late, (spring, late))  # and it is on time
+    off = round_of(named["encoder_eccentricity", "elbow_joint"], 100.0, 100.0 - left)
+    assert not shadowed(off, (spring, off))  # and no inertia answers it
 
 
 @pytest.mark.parametrize(
@@ -1460,8 +1462,8 @@ def test_a_start_far_off_the_data_is_not_fitted_but_for_the_best(identified, nam
 def test_a_search_for_a_motion_that_does_not_repeat_is_given_up(ratio, expected):
     changes = [ratio**i for i in range(4 * STALL_STEPS)]
     assert stalled(changes) is expected and not stalled(changes[: 2 * STALL_STEPS - 1])
-    few = changes[: 4 * STALL_STEPS_OF_LAWS]  # that are enough where each solves laws of gears too
-    assert stalled(few, STALL_STEPS_OF_LAWS) is expected and not stalled(few)
+    few = changes[: 4 * STALL_STEPS_OF_LOOPS]  # that are enough where each solves laws in loops too
+    assert stalled(few, STALL_STEPS_OF_LOOPS) is expected and not stalled(few)
 
 
 @pytest.mark.slow
