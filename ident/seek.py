@@ -99,13 +99,18 @@ def sought(
     Args:
         first: those of the search under the noise that was guessed; ``workers`` where None.
     """
-    found = beside_steps(setup, baseline, max_causes, first or workers)
+    found = beside_steps(dataset, setup, baseline, max_causes, first or workers)
     return beside_steady_records(*under_noise_seen(dataset, *found, max_causes, workers), max_causes, workers)
 
 
-def beside_steps(setup: Setup, baseline: Fit, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
+def beside_steps(
+    dataset: Dataset, setup: Setup, baseline: Fit, max_causes: int, workers: Workers
+) -> tuple[Setup, Fit, Attribution]:
     """Causes of what the baseline leaves; beside the time steps of a simulation that made the records, where a model
-    with some of them shows these and the baseline was too far from the data for that."""
+    with some of them shows these and the baseline was too far from the data for that.
+
+    Where what such a model leaves is noise, and more than was known of, no further ones are sought.
+    """
 
     shown: list[Problem] = []
 
@@ -118,7 +123,10 @@ def beside_steps(setup: Setup, baseline: Fit, max_causes: int, workers: Workers)
             shown.append(stepped)
         return bool(shown)
 
-    result = attribute(setup.problem, baseline, max_causes=max_causes, until=shows_steps, workers=workers)
+    def ends(fit: Fit) -> bool:
+        return shows_steps(fit) or louder(dataset, setup.problem, fit) is not setup.problem
+
+    result = attribute(setup.problem, baseline, max_causes=max_causes, until=ends, workers=workers)
     if not shown or workers.late:
         return setup, baseline, result
     workers.say("time steps of a simulation")
@@ -132,11 +140,11 @@ def under_noise_seen(
 ) -> tuple[Setup, Fit, Attribution]:
     """Causes of what the baseline leaves, under the noise that is seen beside those found."""
     try:
-        louder = with_noise_of_fast_lines(dataset, setup.problem, result.final)
-        if louder is not setup.problem and not workers.late:
+        noisy = louder(dataset, setup.problem, result.final)
+        if noisy is not setup.problem and not workers.late:
             workers.say("more noise")
-            setup, baseline = replace(setup, problem=louder), fit_baseline(louder, workers.say)
-            return setup, baseline, attribute(louder, baseline, max_causes=max_causes, workers=workers)
+            setup, baseline = replace(setup, problem=noisy), fit_baseline(noisy, workers.say)
+            return setup, baseline, attribute(noisy, baseline, max_causes=max_causes, workers=workers)
         other, first = under_noise_beside_causes(dataset, setup, result.final)
     except NOT_COMPUTED:
         return setup, baseline, result
@@ -144,6 +152,14 @@ def under_noise_seen(
         return setup, baseline, result
     workers.say("less noise")
     return other, first, attribute(other.problem, first, max_causes=max_causes, known=result, workers=workers)
+
+
+def louder(dataset: Dataset, problem: Problem, fit: Fit) -> Problem:
+    """``with_noise_of_fast_lines``; the problem itself where there is no such model."""
+    try:
+        return with_noise_of_fast_lines(dataset, problem, fit)
+    except NOT_COMPUTED:
+        return problem
 
 
 def beside_steady_records(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from ident.attribute import attribute
 from ident.baseline import fit_baseline
 from ident.contests import nearly_settled
 from ident.diagnosis import diagnose
@@ -218,7 +219,7 @@ def test_noise_that_was_raised_for_a_cause_is_let_go_once_that_is_known(
     ("joints", "given"),
     [(slice(None), False), (slice(2, 3), False), (slice(None), True), (slice(1, None), True)],
 )
-def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(locked, tmp_path, joints, given):
+def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(locked, tmp_path, monkeypatch, joints, given):
     """Of all joints alike it is seen at the fast lines of motions. At one joint alone it may as well be a cause, and at
     all but one where its size is given."""
     plan = small_plan(locked, 32, points=1, trajectory=True)
@@ -242,5 +243,12 @@ def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(locked, tmp
         assert louder is setup.problem
         return
     assert np.all(louder.tau_std > setup.problem.tau_std)
+    ended = []
+
+    def told(problem, baseline, until=None, **kwargs):
+        ended.append(until is not None and until(baseline))
+        return attribute(problem, baseline, until=until, **kwargs)
+
+    monkeypatch.setattr("ident.seek.attribute", told)
     _, _, result = sought(data, setup, first, 0, Workers())
-    assert not result.detected
+    assert ended == [True, False] and not result.detected
