@@ -61,7 +61,18 @@ from ident.rounds import (
     shadows,
     with_name,
 )
-from ident.screening import Score, _Field, _gain, _line_sums, _lines, _share_of_gears, _Stage, _whole_sums, screen
+from ident.screening import (
+    Score,
+    _Field,
+    _gain,
+    _line_sums,
+    _lines,
+    _share_of_gears,
+    _Stage,
+    _whole_sums,
+    screen,
+    signal_scale,
+)
 from ident.search import (
     DECOYS,
     HOPEFUL,
@@ -1239,6 +1250,27 @@ def test_a_limit_above_the_slow_torque_is_begun_from_where_the_fast_torque_meets
         starts.append(found.start([np.sum(unit * taken) / np.sum(unit**2)]))
     begun = [p[0] for p in starts if p is not None]
     assert begun and all(p == pytest.approx(103.0, rel=0.05) for p in begun)
+
+
+def test_drag_that_falls_beyond_a_speed_is_no_friction_of_the_catalogue(identified, named):
+    _, setup, result = identified
+    problem, drag = setup.problem, named["unknown:falling_drag", "elbow_joint"]
+    speed = 0.6 * signal_scale(problem, predictions(problem, result.model, result.remainders), drag.joint, ()).v
+    truth = np.array([8.0, speed])
+    models = result.model, replace(result.model, effects=(Effect(drag, truth),))
+    before, after = (predictions(problem, m, result.remainders) for m in models)
+    problem = recorded_with(problem, before, after)
+    rubs = [h for h in named.values() if h.joint == drag.joint and ("friction" in h.effect or h is drag)]
+    scores = screen(problem, result, predictions(problem, result.model, result.remainders), rubs)
+    assert drag in [s.hypothesis for s in choose(scores)]
+    found = {}
+    for s in scores:
+        if s.start is not None:
+            start = begin(problem, result, s)[0]
+            found[s.hypothesis.effect] = refit(problem, start, result.weights, result.remainders, 12)
+    own = found.pop(drag.effect)
+    assert own.model.effects[-1].p == pytest.approx(truth, rel=0.02)
+    assert len(found) > 3 and all(other.cost > own.cost + 100.0 for other in found.values() if other is not None)
 
 
 def test_decoys_take_no_place_of_a_named_one(named):

@@ -77,7 +77,7 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
         )
         out.append(link_springs.dress_pack(j, name, yields=True))
         out += [friction.velocity_power(j, name, power) for power in (2, 3)]
-        out.append(friction.rising_friction(j, name))
+        out += [friction.rising_friction(j, name), friction.falling_drag(j, name)]
         out.append(friction.position_friction(j, name, not motions_alone))
         out.append(structure.link_friction(j, name))
         out += [drifts.torque_drift(j, name), sensing.position_scale(j, name)]

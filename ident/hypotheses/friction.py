@@ -550,6 +550,32 @@ def rising_friction(joint: int, place: str) -> Hypothesis:
     )
 
 
+def falling_drag(joint: int, place: str) -> Hypothesis:
+    """Decoy: drag that grows with the speed up to one of its own and falls beyond, as of an eddy-current brake, ``2
+    torque x / (1 + x^2)`` at ``x = v / velocity`` (Smythe, Trans. AIEE 61, 1942)."""
+
+    def unit(motion: Motion, j: int, velocity: float) -> np.ndarray:
+        x = motion.v(j) / velocity
+        return 2.0 * x / (1.0 + x * x)
+
+    return Hypothesis(
+        "unknown:falling_drag",
+        place,
+        joint,
+        "motor",
+        (
+            Parameter("torque", "N m", 1e-9, 1e7, log=True),
+            Parameter("velocity", "rad/s", 1e-6, 1e3, log=True, step=1e-2),
+        ),
+        lambda p, motion, j, k: p[0] * unit(motion, j, p[1]),
+        lambda scale: [(f * scale.v,) for f in (0.15, 0.4, 1.0)],
+        lambda motion, j, k, shape: Screen(
+            (unit(motion, j, shape[0]),), lambda c: np.array([c[0], shape[0]]) if c[0] > 0 else None, shape
+        ),
+        "The residual torque of {joint} grows with its speed to {torque:.3g} N m at {velocity:.3g} rad/s and falls beyond.",
+    )
+
+
 def position_friction(joint: int, place: str, leads: bool = True) -> Hypothesis:
     """Decoy: friction whose size depends on the position of the joint, ``(constant + slope q + curvature q^2)
     sign(v)``."""
