@@ -116,7 +116,8 @@ def without_friction(model: Model, group: Group) -> Model:
         return model  # what is at the motor tells the deflection
     laws = [e.hypothesis for e in model.effects]
     moved = {h.joint for h in laws if h.channel == "drive" or h.options.get("sees_load")}
-    return replace(model, effects=tuple(e for e in model.effects if not is_dry(e) or e.hypothesis.joint in moved))
+    kept = tuple(e for e in model.effects if not is_dry(e) or e.hypothesis.joint in moved)
+    return model if len(kept) == len(model.effects) else replace(model, effects=kept)
 
 
 def _sagging(columns: Columns, pred: Prediction, posture: np.ndarray) -> dict[int, np.ndarray]:

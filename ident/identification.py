@@ -50,8 +50,8 @@ POSTURES = 8  # of a motion at which modes are looked at
 RENEWALS = 3  # at most, of such noise
 LOUD = 2.0  # power of noise as it was guessed, over that which is found, from which it is lowered
 SLOW_LINES = 2.0  # power left at all lines of motions over that at the fast ones, up to which both are noise
-# power of noise beyond that which is given at the joint that has most, over that where it is least; and joints
-ALIKE, FEWEST_ALIKE = 2.0, 3
+ALIKE = 2.0  # power at the joint with most noise over that where it is least, up to which noise that is given is denied
+FEWEST_ALIKE = 3  # joints at least, for that
 RUNAWAY = 20.0  # largest torque of a held-out segment over that of all that is fitted to, above which its loop was lost
 
 
@@ -330,7 +330,7 @@ def with_noise_of_fast_lines(dataset: Dataset, problem: Problem, result: Fit) ->
 
     Noise of which neighbouring samples go together is more there than their differences, or its size, say, at most
     joints. What a model lacks follows the motion, and shows most at the slow lines of it, at some joint. Noise that is
-    given is denied only by about as much of it at all joints.
+    given is denied only by about as much of it at all of three joints or more.
     """
     n, guessed = problem.structure.n, guessed_noise(dataset)[1]
     if not problem.motions_alone or n < (2 if guessed else FEWEST_ALIKE):  # no others to compare a joint with
@@ -340,7 +340,7 @@ def with_noise_of_fast_lines(dataset: Dataset, problem: Problem, result: Fit) ->
         return problem
     if not guessed and not (np.all(whole > LOUD) and whole.max() < ALIKE * whole.min()):
         return problem
-    return replace(problem, tau_std=problem.tau_std * np.sqrt(np.maximum(torque, 1.0)))
+    return replace(problem, tau_std=problem.tau_std * np.sqrt(np.maximum(torque, 1.0)), noise_denied=not guessed)
 
 
 def with_known_noise(problem: Problem) -> Problem:

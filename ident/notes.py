@@ -137,14 +137,14 @@ def drift_note(problem: Problem) -> tuple[str, ...]:
 
 
 def noise_note(problem: Problem, given: np.ndarray) -> tuple[str, ...]:
-    """More noise of the torque than the dataset gives, in a sentence; nothing where that was taken as it is.
+    """More noise of the torque than the dataset gives, in a sentence; nothing where that was not denied.
 
     Args:
         given: (n,) noise of the samples by the dataset, N m.
     """
-    over = problem.tau_std / given
-    if not problem.motions_alone or np.all(over < FAR_OFF):
+    if not problem.noise_denied:
         return ()
+    over = problem.tau_std / given
     return (
         f"In the compared band the torque holds {over.min():.2g} to {over.max():.2g} times the noise that the dataset gives, alike"
         " at all joints and lines, as noise does of which neighbouring samples go together. It is taken for that, and not"

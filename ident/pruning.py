@@ -22,9 +22,8 @@ from ident.torque_fit import Fit
 UNTOLD = 1.0  # standard deviation of a logarithm, from which the data say nothing of a parameter
 # velocity over that at which a motor may as well rest, up to which friction may stand for what holds it then
 NEXT_TO_REST = 2.0
-# of the time by which the turn of a friction leads, or between two samples, in which a motor passes velocities within
-# which the size of its friction is not known
-LED = 0.3
+LED = 0.3  # of the velocity by which the turn of a friction leads, within which its size is not known
+SAMPLED = 0.2  # the same of what the velocity changes by from sample to sample
 # of what a friction explains of motions, that errors of its law where it turns leave
 TURNS_LEAVE = 1e-3
 
@@ -204,15 +203,13 @@ def level(result: Fit, effect: Effect, covariance: np.ndarray) -> bool:
 
 
 def turns_within(problem: Problem, effect: Effect) -> list[float]:
-    """Velocities, rad/s, through which a motor passes within the time by which the turn of a friction leads, or that
-    between two samples: rms, of each group."""
+    """Velocities, rad/s, within which the size of a friction is not known where it turns: shares of those by which its
+    turn leads, or which pass between two samples, of the rms acceleration of each group."""
     names = [q.name for q in effect.hypothesis.parameters]
     lead, j = effect.value("lead") if "lead" in names else 0.0, effect.hypothesis.joint
-    time = max(lead, problem.sampling.sample_time)
-    return [
-        time * float(np.sqrt(2.0 * np.mean(np.sum(np.abs(g.omega**2 * g.Q[..., j]) ** 2, axis=1))))
-        for g in problem.groups
-    ]
+    time = max(LED * lead, SAMPLED * problem.sampling.sample_time)
+    shown = [g.omega[:, None] ** 2 * g.signal_share * g.Q for g in problem.groups]
+    return [time * float(np.sqrt(2.0 * np.mean(np.sum(np.abs(A[..., j]) ** 2, axis=1)))) for A in shown]
 
 
 def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
@@ -220,7 +217,8 @@ def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
 
     Along the record nothing says what friction takes of the torque while a motor rests: what a friction has within
     velocities at which it may as well rest is an error of that. So is what it has within those by which its turn leads:
-    a soft constraint that has a lead takes there what is asked of it; and within those that pass between two samples.
+    a soft constraint that has a lead takes there what is asked of it; and within those that pass in a fraction of a
+    sample.
     """
     h = effect.hypothesis
     if h.options.get("plain", lambda p: False)(effect.p):
@@ -228,7 +226,7 @@ def plainly_special(problem: Problem, model: Model, effect: Effect) -> bool:
     if "within" not in h.options:
         return False
     v = h.options["within"](effect.p)
-    if all(v < LED * x for x in turns_within(problem, effect)):
+    if all(v < x for x in turns_within(problem, effect)):
         return True
 
     def unseen(group: Group) -> bool:

@@ -109,10 +109,10 @@ def beside_steps(
     """Causes of what the baseline leaves; beside the time steps of a simulation that made the records, where a model
     with some of them shows these and the baseline was too far from the data for that.
 
-    Where what such a model leaves is noise, and more than was known of, no further ones are sought.
+    Where what such a model leaves is noise, and more than was known of, they are sought anew under that.
     """
-
     shown: list[Problem] = []
+    noisy: list[Problem] = []
 
     def shows_steps(fit: Fit) -> bool:
         try:
@@ -123,10 +123,18 @@ def beside_steps(
             shown.append(stepped)
         return bool(shown)
 
+    def shows_noise(fit: Fit) -> bool:
+        problem = louder(dataset, setup.problem, fit)
+        if problem is not setup.problem:
+            noisy.append(problem)
+        return bool(noisy)
+
     def ends(fit: Fit) -> bool:
-        return shows_steps(fit) or louder(dataset, setup.problem, fit) is not setup.problem
+        return shows_steps(fit) or shows_noise(fit)
 
     result = attribute(setup.problem, baseline, max_causes=max_causes, until=ends, workers=workers)
+    if noisy and not shown and not workers.late:
+        return under_more_noise(setup, noisy[-1], max_causes, workers)
     if not shown or workers.late:
         return setup, baseline, result
     workers.say("time steps of a simulation")
@@ -142,9 +150,7 @@ def under_noise_seen(
     try:
         noisy = louder(dataset, setup.problem, result.final)
         if noisy is not setup.problem and not workers.late:
-            workers.say("more noise")
-            setup, baseline = replace(setup, problem=noisy), fit_baseline(noisy, workers.say)
-            return setup, baseline, attribute(noisy, baseline, max_causes=max_causes, workers=workers)
+            return under_more_noise(setup, noisy, max_causes, workers)
         other, first = under_noise_beside_causes(dataset, setup, result.final)
     except NOT_COMPUTED:
         return setup, baseline, result
@@ -152,6 +158,14 @@ def under_noise_seen(
         return setup, baseline, result
     workers.say("less noise")
     return other, first, attribute(other.problem, first, max_causes=max_causes, known=result, workers=workers)
+
+
+def under_more_noise(setup: Setup, noisy: Problem, max_causes: int, workers: Workers) -> tuple[Setup, Fit, Attribution]:
+    """Causes sought anew under more noise than was known of."""
+    workers.say("more noise")
+    baseline = fit_baseline(noisy, workers.say)
+    found = attribute(noisy, baseline, max_causes=max_causes, workers=workers)
+    return replace(setup, problem=noisy), baseline, found
 
 
 def louder(dataset: Dataset, problem: Problem, fit: Fit) -> Problem:

@@ -12,7 +12,7 @@ from ident.diagnosis import diagnose
 from ident.hypotheses import catalogue
 from ident.hypotheses.friction import dry
 from ident.model import Effect
-from ident.pruning import LED, plainly_special, turns_within
+from ident.pruning import LED, SAMPLED, plainly_special, turns_within
 from sim.effects.structure import add_spring
 from sim.experiment import draw_drives
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -166,7 +166,7 @@ def test_a_friction_that_is_a_soft_constraint_is_named_and_measured(locked, tmp_
     assert verdict.unexplained_verdict == "noise floor reached"
 
 
-def test_a_dip_within_velocities_that_pass_in_a_sample_or_by_which_a_friction_leads_is_none(identified):
+def test_a_dip_within_velocities_that_pass_in_a_fraction_of_a_sample_or_by_which_a_friction_leads_is_none(identified):
     """Between samples nothing tells its size, and a soft constraint takes what is asked of it there, whatever that
     is."""
     _, setup, result = identified
@@ -185,9 +185,10 @@ def test_a_dip_within_velocities_that_pass_in_a_sample_or_by_which_a_friction_le
         turns_within(setup.problem, Effect(dip, np.array([2.0, 4.0, 0.1, 1e-3, 2.0, x]))) for x in (lead, 0)
     )
     accelerations = [
-        np.sqrt(np.mean(g.to_time(-(g.omega[:, None] ** 2) * g.Q)[..., dip.joint] ** 2)) for g in setup.problem.groups
+        np.sqrt(np.mean(g.to_time(-(g.omega[:, None] ** 2) * g.signal_share * g.Q)[..., dip.joint] ** 2))
+        for g in setup.problem.groups
     ]
-    assert led == pytest.approx([lead * a for a in accelerations], rel=1e-6)
-    assert sampled == pytest.approx([sample * a for a in accelerations], rel=1e-6)
-    assert special(0.5 * LED * min(led), lead) and special(0.5 * LED * min(sampled), 0.0)
-    assert not special(2.0 * LED * max(led), lead) and not special(2.0 * LED * max(sampled), 0.0)
+    assert led == pytest.approx([LED * lead * a for a in accelerations], rel=1e-6)
+    assert sampled == pytest.approx([SAMPLED * sample * a for a in accelerations], rel=1e-6)
+    assert special(0.5 * min(led), lead) and special(0.5 * min(sampled), 0.0)
+    assert not special(2.0 * max(led), lead) and not special(2.0 * max(sampled), 0.0)

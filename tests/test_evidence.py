@@ -101,7 +101,7 @@ from ident.trust import (
 from ident.verdict import LEFT_OUT, UNKNOWN, Cause, Gain, JointGain, Value
 from ident.weights import make_weights
 from robot_assets.errors import DataError
-from robot_assets.robot import load_robot
+from robot_assets.robot import Elasticity, load_robot
 from sim import parse_effect
 from tests.conftest import quick_experiment, small_plan, through_files
 
@@ -600,6 +600,8 @@ def test_a_hinge_right_before_the_first_joint_is_not_the_base_that_moves(identif
     there = structure.model.copy()
     there.jointPlacements[1].translation = np.zeros(3)
     assert not hinges_on_base(replace(structure, model=there))
+    standing = build_structure(structure.robot, elasticities=(Elasticity("ground", "base", (1.0, 0.0, 0.0), 1e6, 1e3),))
+    assert {h.place for h in hinges_on_base(standing)} == {"shoulder_pan_joint"}
 
 
 @settings(deadline=None, max_examples=30)

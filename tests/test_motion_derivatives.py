@@ -8,7 +8,7 @@ import pytest
 from ident.chain import build_structure
 from ident.coordinates import pack, unpack
 from ident.dataset import Dataset, Segment
-from ident.derivatives import jacobian
+from ident.derivatives import jacobian, without_friction
 from ident.graybox import Parameters
 from ident.hypotheses import catalogue
 from ident.identification import guessed_noise, motion_band_hz, set_up
@@ -76,6 +76,25 @@ def test_what_moves_the_links_moves_friction_by_its_load_alone(moving, effect):
         ends = [anew(problem, unpack(full, x + sign * step, np.inf), pred) for sign in (1.0, -1.0)]
         slope = group.observe((ends[0] - ends[1]) / 2e-3)
         assert np.linalg.norm(J[..., c] - slope) < 0.03 * np.linalg.norm(slope)
+
+
+def test_friction_of_the_motor_is_left_out_where_nothing_but_its_motion_moves_it(moving):
+    """Not beside a drive whose torque is no longer that of the motor, nor beside friction that sees the load."""
+    problem, model, _ = moving
+    named = {h.key: h for h in catalogue(problem.structure, motions_alone=True)}
+
+    def left(*keys):
+        effects = tuple(Effect(named[key], np.ones(len(named[key].parameters))) for key in keys)
+        kept = without_friction(replace(model, effects=effects), problem.groups[0])
+        return [e.hypothesis.key for e in kept.effects]
+
+    rubs, ripple = ("coulomb_friction", "elbow_joint"), ("cogging", "elbow_joint")
+    assert left(rubs, ripple) == [ripple]
+    for beside in (("torque_saturation", "elbow_joint"), ("load_dependent_friction", "elbow_joint")):
+        assert left(rubs, beside) == [rubs, beside]
+    elsewhere = ("torque_saturation", "wrist_1_joint")
+    assert left(rubs, elsewhere) == [elsewhere]
+    assert without_friction(model, problem.groups[0]) is model
 
 
 @pytest.fixture(scope="module")

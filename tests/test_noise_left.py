@@ -21,6 +21,7 @@ from ident.identification import (
     with_noise_that_is_left,
 )
 from ident.noise import DOUBT, alike_at_all_lines, torque_noise_left
+from ident.notes import noise_note
 from ident.parallel import Workers
 from ident.problem import predictions
 from ident.refits import reweighted
@@ -252,3 +253,6 @@ def test_noise_of_which_neighbouring_samples_go_together_is_no_cause(locked, tmp
     monkeypatch.setattr("ident.seek.attribute", told)
     _, _, result = sought(data, setup, first, 0, Workers())
     assert ended == [True, False] and not result.detected
+    notes = noise_note(louder, locked.array("tau_std"))
+    assert bool(notes) == given == louder.noise_denied and all("not for a cause" in x for x in notes)
+    assert noise_note(replace(setup.problem, tau_std=9.0 * setup.problem.tau_std), locked.array("tau_std")) == ()

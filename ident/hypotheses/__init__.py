@@ -22,6 +22,7 @@ from ident.hypotheses import (
 from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
 from robot_assets.robot import linear_joints
 
+AT_ORIGIN = 1e-4  # m, from the base's origin
 LEAST_DAMPING = 1e-6  # s, of a gear, over its stiffness
 SHARPER = (  # with a parameter that motions do not show
     friction.coulomb_friction,
@@ -103,12 +104,15 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
         loaded = index not in known and any(chain.bodies[load.link][0] == index for load in robot.loads)
         for with_load in (False, True)[: 1 + loaded]:
             out.append(bodies.link_inertia(link, _joint_of_body(chain, index), carries, with_load))
+    off_base = np.array([_off_base(chain, j) for j in range(len(names))])
     for j, name in enumerate(names):
-        on_base, off_origin = _on_base(chain, j)
-        # At the origin of the base it would be the base that moves.
-        for before in (False, True)[: 1 + (off_origin or not on_base)]:
+        # Of an arm whose only joint on the base stands at its origin it would be the base that moves.
+        same = off_base[j] <= AT_ORIGIN and np.sum(np.isfinite(off_base)) == 1
+        for before in (False, True)[: 2 - same]:
             out += [
-                hinges.compliance(name, j, axes, "transverse_elasticity", before, before and on_base)
+                hinges.compliance(
+                    name, j, axes, "transverse_elasticity", before, before and bool(np.isfinite(off_base[j]))
+                )
                 for axes in _turned(_across(chain, j))
             ]
     if robot.n > 1 and np.any(robot.gravity):  # of a single joint it is a body whose centre is elsewhere
@@ -159,10 +163,14 @@ def _index(chain: Structure, joint: int) -> int:
     return next(i for i in range(1, chain.model.njoints) if chain.model.idx_vs[i] == chain.driven[joint])
 
 
-def _on_base(chain: Structure, joint: int) -> tuple[bool, bool]:
-    """Whether a joint is carried by the base, and whether off its origin."""
-    index = _index(chain, joint)
-    return chain.model.parents[index] == 0, bool(np.any(chain.model.jointPlacements[index].translation))
+def _off_base(chain: Structure, joint: int) -> float:
+    """Distance of a joint that the base carries, on hinges of its description or without, from the base's origin, m;
+    infinite where another joint carries it."""
+    model, index = chain.model, _index(chain, joint)
+    place, parent = model.jointPlacements[index], model.parents[index]
+    while parent and model.idx_vs[parent] in chain.elastic:
+        place, parent = model.jointPlacements[parent] * place, model.parents[parent]
+    return np.inf if parent else float(np.linalg.norm(place.translation))
 
 
 def _across(chain: Structure, joint: int) -> np.ndarray:

@@ -552,7 +552,7 @@ def rising_friction(joint: int, place: str) -> Hypothesis:
 
 def falling_drag(joint: int, place: str) -> Hypothesis:
     """Decoy: drag that grows with the speed up to one of its own and falls beyond, as of an eddy-current brake, ``2
-    torque x / (1 + x^2)`` at ``x = v / velocity`` (Smythe, Trans. AIEE 61, 1942)."""
+    torque x / (1 + x^2)`` at ``x = v / velocity`` (Wouterse, IEE Proc. B 138, 1991)."""
 
     def unit(motion: Motion, j: int, velocity: float) -> np.ndarray:
         x = motion.v(j) / velocity
