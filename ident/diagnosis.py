@@ -34,7 +34,7 @@ from ident.values import named_effects
 from ident.verdict import UNKNOWN, Diagnosis, Verdict
 from robot_assets.robot import guessed_drives
 
-MAX_SECONDS = 600.0  # of search for causes
+MAX_SECONDS = 480.0  # of search for causes: with the fits that follow, ten minutes on two cores
 END_HELD_OUT = "the end of the only motion, held out"
 
 
