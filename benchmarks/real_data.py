@@ -271,7 +271,7 @@ def main() -> None:
     parser.add_argument(
         "--references", action="store_true", help="print what the references leave, and diagnose nothing"
     )
-    parser.add_argument("--max-seconds", type=float, default=600.0)
+    parser.add_argument("--max-seconds", type=float, default=480.0)
     args = parser.parse_args()
     only = set(filter(None, args.only.split(",")))
     chosen = [m for m in MACHINES if not only or m.folder in only]

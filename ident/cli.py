@@ -248,7 +248,7 @@ def diagnose(
     max_causes: Annotated[int, typer.Option(min=0)] = 4,
     max_seconds: Annotated[
         float, typer.Option(min=0.0, help="After which no further search for causes begins.")
-    ] = 600.0,
+    ] = 480.0,
     executor: Annotated[
         str, typer.Option(help="Where candidates are fitted: threads, processes, processes:N or dask://HOST:PORT.")
     ] = "threads",
