@@ -3,6 +3,7 @@ that show on the way."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,7 +135,8 @@ def beside_steps(
 
     result = attribute(setup.problem, baseline, max_causes=max_causes, until=ends, workers=workers)
     if noisy and not shown and not workers.late:
-        return under_more_noise(setup, noisy[-1], max_causes, workers)
+        with suppress(*NOT_COMPUTED):
+            return under_more_noise(setup, noisy[-1], max_causes, workers)
     if not shown or workers.late:
         return setup, baseline, result
     workers.say("time steps of a simulation")
