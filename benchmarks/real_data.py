@@ -22,7 +22,7 @@ from published import EMPS, References, drive_found, emps_relative_error, motion
 from ident.convert import convert_logs
 from ident.dataset import Dataset
 from ident.dataset_io import load_dataset, save_dataset
-from ident.diagnosis import diagnose_fully
+from ident.diagnosis import MAX_SECONDS, diagnose_fully
 from ident.show.figures import trace_figure
 from ident.units import torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis, Gain
@@ -271,7 +271,7 @@ def main() -> None:
     parser.add_argument(
         "--references", action="store_true", help="print what the references leave, and diagnose nothing"
     )
-    parser.add_argument("--max-seconds", type=float, default=480.0)
+    parser.add_argument("--max-seconds", type=float, default=MAX_SECONDS)
     args = parser.parse_args()
     only = set(filter(None, args.only.split(",")))
     chosen = [m for m in MACHINES if not only or m.folder in only]
