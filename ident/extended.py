@@ -15,8 +15,6 @@ from ident.hypotheses import kernels
 from ident.hypotheses.hypothesis import Hypothesis
 from ident.inverse import (
     REMAINDER_STEPS,
-    STALL_STEPS,
-    STALL_STEPS_OF_LOOPS,
     Plane,
     Sampling,
     make_plane,
@@ -207,7 +205,6 @@ def predict_at(
         react=react,
         passes=passes,
         steps=steps,
-        patience=STALL_STEPS_OF_LOOPS if any(map(has_loop, inner)) else STALL_STEPS,
     )
     if motor:
         motion = Motion(group, solution, par, delivered=given, told=along)

@@ -27,24 +27,25 @@ from ident.graybox import (
     Linearisation,
     Parameters,
     alias_response,
+    damping_diagonal,
     equilibrium,
     hold_response,
     impedance,
     linearise,
     rotor_inertia,
+    stiffness_diagonal,
 )
 from ident.group import Group
 from ident.mixing import mixed
 from ident.motion import Solution, Torques
 from ident.recursion import chain_of, newton_euler
 from ident.time_steps import TimeSteps, differences
+from ident.varying import along
 
 REMAINDER_STEPS = 250  # fixed-point steps at most for the geometric remainder
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
-# in which the change must halve: where no motion repeats the search for one does not end. Large motions of links that
-# are hardly damped take a direction of the search for each resonant line, and more than forty steps for a half.
-STALL_STEPS = 45
-STALL_STEPS_OF_LOOPS = 12  # the same where each step solves laws in loops too, and takes far longer
+PLAIN_STEPS = 4  # in which the change must halve, or the arm is linearised along the motion
+NEWTON_STEPS = 12  # the same of steps with that: where no motion repeats the search for one does not end
 ROOM = 1 << 29  # bytes for past steps
 NEAR_CHANGE = 1e-4  # the same from that of a model near by: the next step of a contraction brings far less
 LEAST_KEPT = 0.1  # of the torque, that its record keeps of any line
@@ -222,7 +223,6 @@ def solve(
     react: Callable[[Solution], Torques] | None = None,
     passes: int = 1,
     steps: int = 0,
-    patience: int = STALL_STEPS,
 ) -> Solution:
     """Recorded motor torque that the model predicts along the measured motion.
 
@@ -233,8 +233,7 @@ def solve(
         react: torques that go with a solution; the result is consistent with them. None holds
             ``torques``.
         passes: of ``react`` at most until they do; one where it is exact by itself.
-        steps: fixed-point steps on the remainder, at most; a start that is near ends them sooner.
-        patience: steps in which the change must halve.
+        steps: on the remainder, at most; a start that is near ends them sooner.
 
     Raises:
         FloatingPointError: the motion of the links runs away.
@@ -244,33 +243,97 @@ def solve(
     enough = NEAR_CHANGE
     if W is None:
         W, enough = static_remainder(structure, par, plane, group), REMAINDER_CHANGE
-    if react is not None:
-        torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-    left, changes = np.arange(len(W)), []
-    past: list[tuple[np.ndarray, np.ndarray]] = []
-    for _ in range(steps):
-        Q_a = link_motion(structure, par, plane, Q, W, torques)
-        change = geometric_remainder(structure, plane, group, Q_a) - W
-        if not np.all(np.isfinite(change)):
+
+    def settled(W: np.ndarray, torques: Torques) -> Torques:
+        return torques if react is None else _settle(structure, par, plane, Q, W, torques, react, passes)
+
+    def motion(W: np.ndarray, torques: Torques) -> np.ndarray:
+        return link_motion(structure, par, plane, Q, W, torques)
+
+    def change(W: np.ndarray, torques: Torques) -> np.ndarray:
+        return geometric_remainder(structure, plane, group, motion(W, torques)) - W
+
+    search = _Search(change, settled, ROUNDING * np.abs(group.U).max(), enough)
+    torques = settled(W, torques)
+    W, torques, left = search.run(W, torques, np.arange(len(W)), lambda change, left: change, steps, PLAIN_STEPS)
+    if steps and len(left):
+        # Where links hang on lightly damped gears and move far, steps by the arm at rest lead away.
+        near = along(
+            chain_of(structure.model),
+            stiffness_diagonal(structure, par),
+            damping_diagonal(structure, par),
+            (plane.lin.M, plane.lin.Kg),
+            group,
+            motion(W, torques)[left],
+        )
+        row = {record: i for i, record in enumerate(left)}
+        W, torques, _ = search.run(
+            W, torques, left, lambda change, left: near.step(change, [row[i] for i in left]), steps, NEWTON_STEPS
+        )
+        if not np.all(np.isfinite(change(W, torques)[left])):
             raise FloatingPointError("the motion of the links cannot be solved")
-        # Where links hang on lightly damped gears the plain step leads away along many directions: all are remembered.
-        past = [*past, (W[left], change[left])][-max(STALL_STEPS, ROOM // (4 * W[left].nbytes)) :]
-        W = W.copy()
-        W[left] = mixed(past)
-        if react is not None:
-            torques = _settle(structure, par, plane, Q, W, torques, react, passes)
-        # An axis that bears no gravity has no remainder but rounding.
-        off = np.abs(change[left]).max(axis=(1, 2)) / max(np.abs(W).max(), ROUNDING * np.abs(group.U).max())
-        moving = off > enough
-        changes.append(off.max())
-        if not np.any(moving) or stalled(changes, patience):
-            break
-        if not np.all(moving):
-            left, past = left[moving], [(x[moving], f[moving]) for x, f in past]
     return _solution(structure, par, plane, Q, W, torques)
 
 
-def stalled(changes: Sequence[float], patience: int = STALL_STEPS) -> bool:
+@dataclass(frozen=True)
+class _Search:
+    """For a remainder that the motion which it causes has.
+
+    Attributes:
+        change: of a remainder (S, L, N) with torques.
+        settled: torques with a remainder, from those of one near by.
+        rounding: N m, below which a remainder is none.
+        enough: change, relative to the largest remainder, that ends it.
+    """
+
+    change: Callable[[np.ndarray, Torques], np.ndarray]
+    settled: Callable[[np.ndarray, Torques], Torques]
+    rounding: float
+    enough: float
+
+    def run(
+        self,
+        W: np.ndarray,
+        torques: Torques,
+        left: np.ndarray,
+        step: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        steps: int,
+        patience: int,
+    ) -> tuple[np.ndarray, Torques, np.ndarray]:
+        """The nearest remainder found, torques with it, and the records that are not there yet.
+
+        Args:
+            left: records to solve.
+            step: of the remainders of records, from their changes and which they are.
+            steps: at most.
+            patience: steps in which the change must halve.
+        """
+        nearest, begin, least = W.copy(), torques, np.full(len(W), np.inf)
+        changes: list[float] = []
+        past: list[tuple[np.ndarray, np.ndarray]] = []
+        for _ in range(steps):
+            change = self.change(W, torques)[left]
+            off = np.abs(change).max(axis=(1, 2)) / max(np.abs(W).max(), self.rounding)
+            if not np.all(np.isfinite(off)):
+                break
+            better = left[off < least[left]]
+            nearest[better], least[left] = W[better], np.minimum(off, least[left])
+            past = [*past, (W[left], step(change, left))][-max(PLAIN_STEPS, ROOM // (4 * W[left].nbytes)) :]
+            W = W.copy()
+            W[left] = mixed(past)
+            torques = self.settled(W, torques)
+            moving = off > self.enough
+            nearest[left[~moving]] = W[left[~moving]]
+            changes.append(float(off.max()))
+            left, past = left[moving], [(x[moving], f[moving]) for x, f in past]
+            if not len(left):
+                return W, torques, left
+            if stalled(changes, patience):
+                break
+        return nearest, self.settled(nearest, begin), left
+
+
+def stalled(changes: Sequence[float], patience: int) -> bool:
     """Whether the last so many changes of a search for a fixed point have none below half of all before."""
     last, before = changes[-patience:], changes[:-patience]
     return len(before) >= patience and min(last) > 0.5 * min(before)

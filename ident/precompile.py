@@ -14,6 +14,7 @@ from ident.hypotheses.kernels import BACKLASH, HYSTERESIS, Law, along_motion
 from ident.hypotheses.loop import steady_loop
 from ident.hypotheses.yielding import bristle, dipping_bristle
 from ident.recursion import chain_of, newton_euler
+from ident.varying import factorised, march
 from robot_assets.robot import load_robot
 
 
@@ -23,6 +24,8 @@ def precompile() -> None:
     one, line = np.ones((1, 1)), np.zeros(1, complex)
     link_compliance(one, one, one[0], one[0], line, line)
     newton_euler(chain_of(build_structure(load_robot("twomass")).model), *np.zeros((3, 1, 1)))
+    path = np.ones((1, 1, 1))
+    march(factorised(path), path, path, 1e-3, 0.25, np.zeros(2), one[0], one, one.copy())
     direction(still, 1e-3)
     bristle(still, 1e-3, 1e-3, start=np.zeros(1))
     dipping_bristle(still, 1e-3, 1e3, np.ones((1, 4)))
