@@ -115,7 +115,9 @@ def weigh(
     the data narrow them down (``occam``), at the joints where the effect is seen. What explains far less than the best
     of them may be another cause, at a joint that little is left at: all that it leaves counts as at the joints of the
     best. A load and a change of the body that bears it are one body to the data but for how its inertia may turn out:
-    what sets them apart at any joint counts against the model error at all of them, which reaches them all.
+    what sets them apart at any joint counts against the model error at all of them, which reaches them all. One of which
+    nothing is left that another does not hold comes after any that explains as much: it may be ahead by errors of laws
+    alone, as a cable without a spring is of the friction of a motor.
 
     Args:
         excess: (n,) cost beyond noise by joint that the best of them leaves (``errors_by_joint``).
@@ -138,6 +140,10 @@ def weigh(
     far = np.sum(more, axis=1) > FAR * np.sum(falls)
     evidence = np.where(far, np.minimum(evidence, -0.5 * np.sum(more, axis=1) / seen), evidence) - DECOY_NATS * decoy
     evidence += [occam(c, seen) + odds(c) for c in candidates]
+    empty = np.array([last_is_pointless(c.fit) for c in candidates])
+    full = ~empty & ~far & (decoy == 0.0)
+    if np.any(full):
+        evidence = np.where(empty, np.minimum(evidence, evidence[full].max() - POINTLESS_NATS), evidence)
     evidence -= evidence.max()
     probability = np.exp(evidence) / np.exp(evidence).sum()
     out = [

@@ -385,6 +385,21 @@ def test_an_encoder_that_is_off_its_centre_errs_by_the_true_angle(identified):
     assert error == pytest.approx(0.03 * np.sin(true) + 0.02 * np.cos(true), abs=1e-5)
 
 
+def test_a_cable_without_a_spring_comes_after_the_friction_that_explains_as_much(named):
+    """Errors of how one and the other turn may be many times the noise; what explains far less it still beats."""
+    cable, rub = named["dress_pack", "elbow_joint"], named["coulomb_friction", "elbow_joint"]
+    excess, falls = np.zeros(6), np.full(6, 1e5)
+
+    def first(spring, cost):
+        bundle = candidate(cable, [spring, 3.0, 1e-3, 0.0], [1e4, 1e4, 0.0, 0.0])
+        friction = candidate(rub, [3.0, 0.0, 1e-3, 0.0], [1e4, 0.0, 0.0, 0.0], cost=cost)
+        return weigh([bundle, friction], excess, falls)[0].hypothesis
+
+    assert first(1e-3, 2000.0) is rub
+    assert first(30.0, 2000.0) is cable
+    assert first(1e-3, 1e5) is cable
+
+
 def test_a_law_and_its_limit_tie_where_the_data_cannot_tell_them_apart(named):
     gap, soft = named["backlash", "elbow_joint"], named["softening_stiffness", "elbow_joint"]
     one, two = candidate(gap, [5e-4, 0.0], [1e5, 0.0]), candidate(soft, [3e3, 3e-4], [0.0, 1e5])
