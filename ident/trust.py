@@ -269,7 +269,9 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
             # acceleration as an error of the position does.
             continue
         least = SHADOW
-        if element(o) is not None and element(o) == element(h) and not explained_by_time(found):
+        alike = element(o) is not None and element(o) == element(h)
+        cable = o.effect == "dress_pack" and element(h) == "friction"  # of which the law has a friction too
+        if (alike or cable) and not explained_by_time(found):
             least = SHADOW_OF_LAW
         if overtone(found, other):
             least = HARMONIC

@@ -323,6 +323,8 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
     assert not shadowed(late, (spring, late))  # and it is on time
     off = round_of(named["encoder_eccentricity", "elbow_joint"], 100.0, 100.0 - left)
     assert not shadowed(off, (spring, off))  # and no inertia answers it
+    cable = round_of(named["dress_pack", "elbow_joint"], 1100.0, 100.0)
+    assert shadowed(rub, (cable, rub)) is (left < 50.0)  # a cable rubs by itself, and its law lacks some of that
 
 
 @pytest.mark.parametrize(
