@@ -14,7 +14,7 @@ from ident.coordinates import coordinate_names, moves_geometry, moves_links, pac
 from ident.errors_in_variables import impedance_slopes, scatter_information, scatter_slope
 from ident.extended import Prediction, of_channel, predict, predict_at, through_drives
 from ident.group import Group
-from ident.inverse import Plane, baseline_products
+from ident.inverse import Plane, along_motion, baseline_products
 from ident.model import Effect, Model, is_dry, joints_along_record
 from ident.motion import Motion
 from ident.parallel import map_threads
@@ -25,6 +25,7 @@ from ident.stiction import as_free, held
 
 TIMING_STEP = 1e-6  # s, for differences
 BASELINE_STEP = 1e-3  # of logarithms, for differences
+STEPS_ALONG_MOTION = 4  # of the links beside a model near by: what they move beyond the solved lines is not in one
 
 
 def jacobian(
@@ -37,6 +38,9 @@ def jacobian(
             held without, which beside such laws ends short of the minimum, and tells of less spread than there is.
         shifts: what moves the arm to another posture moves all lines, to first order, where the remainder is held.
     """
+    # With the remainder held derivatives point elsewhere where it took the links along their motion to find it.
+    pred = along_its_motion(pred)
+    exact = exact or pred.solution.torques.varying is not None
     m = len(model.par.to_log())
     top = compared_lines(group)
     motion = group.window is not None
@@ -86,8 +90,10 @@ class _Near:
     pred: Prediction
 
     def again(self, model: Model, steps: int) -> Prediction:
-        """What a model near by predicts, with the geometric remainder ``steps`` on."""
+        """What a model near by predicts, with the geometric remainder ``steps`` on; more of them along the motion."""
         W, torques = self.pred.solution.W, self.pred.solution.torques
+        if torques.varying is not None:
+            steps *= STEPS_ALONG_MOTION
         return predict(model, self.group, self.problem.sampling, W=W, steps=steps, torques=torques)
 
     @cached_property
@@ -104,6 +110,21 @@ class _Near:
         """(S, K, n + M) change of the compared outputs, one step on, to a model whose links move otherwise along the
         same motion of the motors."""
         return _change(self.group, self.again(without_friction(there, self.group), 1), self.remade_bare, None)
+
+
+def along_its_motion(pred: Prediction) -> Prediction:
+    """A prediction with the links linearised along the very motion that it found, where that took such and an arm can
+    move so."""
+    solution = pred.solution
+    varying = solution.torques.varying
+    if varying is None:
+        return pred
+    records = varying.records
+    try:
+        varying = along_motion(pred.structure, pred.par, pred.plane, pred.group, records, solution.Q_a[records])
+    except FloatingPointError:
+        return pred
+    return replace(pred, solution=replace(solution, torques=replace(solution.torques, varying=varying)))
 
 
 def without_friction(model: Model, group: Group) -> Model:

@@ -192,7 +192,7 @@ def predict_at(
         else None
     )
     passes = 1 if len(inner) == 1 and has_loop(inner[0]) else REACTION_STEPS
-    start = torques if inner else Torques()
+    start = torques if inner else Torques(varying=torques.varying)
     solution = solve(
         structure,
         par,

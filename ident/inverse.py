@@ -40,7 +40,7 @@ from ident.mixing import mixed
 from ident.motion import Solution, Torques
 from ident.recursion import chain_of, newton_euler
 from ident.time_steps import TimeSteps, differences
-from ident.varying import along
+from ident.varying import Varying, along
 
 REMAINDER_STEPS = 250  # fixed-point steps at most for the geometric remainder
 REMAINDER_CHANGE = 1e-6  # change, relative to the largest remainder, that ends them from a cold start
@@ -254,25 +254,37 @@ def solve(
         return geometric_remainder(structure, plane, group, motion(W, torques)) - W
 
     search = _Search(change, settled, ROUNDING * np.abs(group.U).max(), enough)
+    varying = torques.varying
     torques = settled(W, torques)
-    W, torques, left = search.run(W, torques, np.arange(len(W)), lambda change, left: change, steps, PLAIN_STEPS)
-    if steps and len(left):
+    step = plain_step if varying is None else varying.step
+    W, torques, left = search.run(W, torques, np.arange(len(W)), step, steps, PLAIN_STEPS)
+    if len(left) and steps > 2 * PLAIN_STEPS:  # so many tell that it creeps
         # Where links hang on lightly damped gears and move far, steps by the arm at rest lead away.
-        near = along(
-            chain_of(structure.model),
-            stiffness_diagonal(structure, par),
-            damping_diagonal(structure, par),
-            (plane.lin.M, plane.lin.Kg),
-            group,
-            motion(W, torques)[left],
-        )
-        row = {record: i for i, record in enumerate(left)}
-        W, torques, _ = search.run(
-            W, torques, left, lambda change, left: near.step(change, [row[i] for i in left]), steps, NEWTON_STEPS
-        )
+        varying = along_motion(structure, par, plane, group, left, motion(W, torques)[left])
+        W, torques, _ = search.run(W, torques, left, varying.step, steps, NEWTON_STEPS)
         if not np.all(np.isfinite(change(W, torques)[left])):
             raise FloatingPointError("the motion of the links cannot be solved")
-    return _solution(structure, par, plane, Q, W, torques)
+    return _solution(structure, par, plane, Q, W, replace(torques, varying=varying))
+
+
+def along_motion(
+    structure: Structure, par: Parameters, plane: Plane, group: Group, records: np.ndarray, Q_a: np.ndarray
+) -> Varying:
+    """The links linearised along motions (S, L, N) of some records of a group.
+
+    Raises:
+        FloatingPointError: no arm moves so.
+    """
+    springs = stiffness_diagonal(structure, par), damping_diagonal(structure, par)
+    try:
+        return along(chain_of(structure.model), *springs, (plane.lin.M, plane.lin.Kg), group, records, Q_a)
+    except np.linalg.LinAlgError:
+        raise FloatingPointError("the links cannot be linearised along their motion") from None
+
+
+def plain_step(change: np.ndarray, records: np.ndarray) -> np.ndarray:
+    """By how much to move the remainder of records, by the arm at rest."""
+    return change
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from ident.graybox import Parameters, rotor_inertia
 from ident.group import Group, signal_share
 from ident.time_steps import differences
+from ident.varying import Varying
 
 
 @dataclass(frozen=True)
@@ -32,13 +33,14 @@ class Torques:
     """What effects add to the linear arm, as spectra; each (S, L, n) or (S, L, N) for ``link``.
 
     ``steady``: of laws that the arm moves, by the ``key`` of their hypothesis, as they were solved, from which others go
-    on.
+    on; so they do from ``varying``, the links along a motion that was not found without.
     """
 
     spring: np.ndarray | float = 0.0
     link: np.ndarray | float = 0.0
     motor: np.ndarray | float = 0.0
     steady: Mapping[tuple[str, str], Steady] = field(default_factory=dict)
+    varying: Varying | None = None
 
 
 @dataclass(frozen=True)

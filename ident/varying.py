@@ -32,9 +32,10 @@ STEP = 1e-6  # of a difference by position, rad, and by velocity, rad/s
 
 @dataclass(frozen=True)
 class Varying:
-    """Links along the motions of S records, T points of time each.
+    """Links along the motions of S records of a group, T points of time each.
 
     Attributes:
+        records: (S,) which they are.
         group: with the lines of the motion, on the time grid.
         factors: (S, T, N, N) triangular factors of what resists an acceleration in a step of time.
         by_velocity, by_position: (S, T, N, N) slopes of the torque.
@@ -44,6 +45,7 @@ class Varying:
         at_rest: (L, N, N) torque per position of the arm at rest, in the same steps of time.
     """
 
+    records: np.ndarray
     group: Group
     factors: np.ndarray
     by_velocity: np.ndarray
@@ -53,27 +55,32 @@ class Varying:
     turn: np.ndarray
     at_rest: np.ndarray
 
-    def step(self, change: np.ndarray, records: Sequence[int]) -> np.ndarray:
+    def step(self, change: np.ndarray, records: np.ndarray) -> np.ndarray:
         """By how much to move the remainder (R, L, N) of R records, which the motion that it causes would change by
         ``change``, N m.
 
-        ``change`` itself for links that stay near the posture at rest.
+        ``change`` itself for links that stay near the posture at rest, and for records that are not linearised.
         """
-        lines = self.at_rest.shape[0]
-        load = self.group.to_time(-change[:, :lines])
+        out = change.copy()
+        there = np.flatnonzero(np.isin(records, self.records))
+        if len(there):
+            rows = np.searchsorted(self.records, records[there])
+            out[there, : len(self.at_rest)] = self._answer(change[there, : len(self.at_rest)], rows)
+        return out
+
+    def _answer(self, change: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        load = self.group.to_time(-change)
         h = self.group.period_time / self.group.n_time
         moved = np.empty_like(load)
         N = load.shape[-1]
-        for i, f, path in zip(records, load, moved, strict=True):
+        for i, f, path in zip(rows, load, moved, strict=True):
             slopes = self.factors[i], self.by_velocity[i], self.by_position[i], h, self.beta
             still = np.zeros(2 * N)
             end = march(*slopes, still, np.linalg.solve(self.inertia[i], f[0]), f, path)
             start = np.linalg.solve(np.eye(2 * N) - self.turn[i], end)
             march(*slopes, start, self._acceleration(i, start, f[0]), f, path)
-        out = np.zeros_like(change)
         moved = np.roll(moved, 1, axis=1)  # the last point is the first of the next period
-        out[:, :lines] = -np.einsum("lab,slb->sla", self.at_rest, self.group.to_lines(moved))
-        return out
+        return -np.einsum("lab,slb->sla", self.at_rest, self.group.to_lines(moved))
 
     def _acceleration(self, i: int, state: np.ndarray, load: np.ndarray) -> np.ndarray:
         q, v = np.split(state, 2)
@@ -81,15 +88,24 @@ class Varying:
 
 
 def along(
-    chain: Chain, spring: np.ndarray, damper: np.ndarray, rest: Sequence[np.ndarray], group: Group, Q_a: np.ndarray
+    chain: Chain,
+    spring: np.ndarray,
+    damper: np.ndarray,
+    rest: Sequence[np.ndarray],
+    group: Group,
+    records: np.ndarray,
+    Q_a: np.ndarray,
 ) -> Varying:
     """Links linearised along a motion.
 
     Args:
         spring, damper: (N,) at the coordinates, N m/rad and N m s/rad.
         rest: M, Kg (N, N) of the arm at rest, kg m2 and N m/rad.
-        group: of the records.
-        Q_a: (S, L, N) motion of the links, rad.
+        records: (S,) which of the group's.
+        Q_a: (S, L, N) motion of their links, rad.
+
+    Raises:
+        FloatingPointError: no arm moves so.
     """
     slow = group.slow()
     lines, N = len(slow.omega), Q_a.shape[-1]
@@ -97,7 +113,10 @@ def along(
     steps = np.clip(fastest * group.period_time / AIMED_TURN, POINTS * lines, MOST_POINTS * lines)
     grid = replace(slow, n_time=scipy.fft.next_fast_len(int(steps), real=True))
     s = 1j * slow.omega[:, None]
-    M, C, K = slopes(chain, *(grid.to_time(s**k * Q_a[:, :lines]) for k in range(3)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        M, C, K = slopes(chain, *(grid.to_time(s**k * Q_a[:, :lines]) for k in range(3)))
+    if not all(np.all(np.isfinite(x)) for x in (M, C, K)):
+        raise FloatingPointError("the links cannot be linearised along their motion")
     k = np.arange(N)
     C[..., k, k] += damper
     K[..., k, k] += spring
@@ -113,7 +132,7 @@ def along(
     square = 2.0 / h * mean * rate
     of_rest = square * rest[0] + rate * np.diag(damper) + (np.diag(spring) + rest[1])
     turn = np.empty((len(Q_a), 2 * N, 2 * N))
-    out = Varying(grid, factors, C, K, beta, inertia, turn, of_rest)
+    out = Varying(records, grid, factors, C, K, beta, inertia, turn, of_rest)
     nothing = np.zeros((grid.n_time, N))
     path = np.empty_like(nothing)
     for i in range(len(Q_a)):

@@ -6,9 +6,19 @@ import numpy as np
 import pytest
 
 from ident import inverse
+from ident.coordinates import pack, unpack
+from ident.derivatives import jacobian
 from ident.extended import predict
 from ident.identification import set_up
-from ident.inverse import NEWTON_STEPS, REMAINDER_STEPS, geometric_remainder, make_plane, solve, true_position
+from ident.inverse import (
+    NEWTON_STEPS,
+    REMAINDER_STEPS,
+    baseline_products,
+    geometric_remainder,
+    make_plane,
+    solve,
+    true_position,
+)
 from ident.model import Model
 from robot_assets.robot import load_robot
 from tests.conftest import quick_experiment, small_plan, through_files
@@ -56,3 +66,31 @@ def test_links_whose_motion_does_not_repeat_are_given_up(clean, monkeypatch):
     monkeypatch.setattr(inverse, "geometric_remainder", unsettled)
     predict(Model(problem.structure, problem.nominal), problem.groups[0], problem.sampling)
     assert 2 * NEWTON_STEPS <= len(asked) < REMAINDER_STEPS
+
+
+def test_derivatives_follow_links_whose_motion_took_the_links_along_it_to_find(clean, monkeypatch):
+    """With the remainder held those of the gears point elsewhere, and a fit of such arms ends nowhere."""
+    problem = set_up(clean[0]).problem
+    group = next(g for g in problem.groups if g.window is None).pick(np.arange(2))
+    Q = true_position(group, problem.nominal, problem.sampling).copy()
+    Q[:, 1:] *= 30.0
+    group = replace(group, Q=Q)
+    model = Model(problem.structure, replace(problem.nominal, damping=0.3 * problem.nominal.damping))
+    problem = replace(problem, groups=(group,), sampling=replace(problem.sampling, hold="none"))
+    at = predict(model, group, problem.sampling)
+    there = at.solution
+    assert there.torques.varying is not None
+    found = jacobian(problem, model, group, at).dense()
+    held = baseline_products(at.structure, at.par, at.plane, there, found.shape[1]).dense()
+    monkeypatch.setattr(inverse, "NEAR_CHANGE", 1e-8)
+    x, n = pack(model), model.structure.n
+
+    def solved(x):
+        model_there, begin = unpack(model, x, np.inf), {"W": there.W, "torques": there.torques}
+        return predict(model_there, group, problem.sampling, steps=REMAINDER_STEPS, **begin).U[:, : found.shape[1]]
+
+    for c in (1, n + 2):  # stiffness of a gear, damping of another
+        step = 1e-4 * (np.arange(len(x)) == c)
+        expected = (solved(x + step) - solved(x - step)) / 2e-4
+        off = [np.linalg.norm(J[..., c] - expected) / np.linalg.norm(expected) for J in (found, held)]
+        assert off[0] < 0.1 < 0.5 < off[1]
