@@ -17,9 +17,14 @@ from ident.rest import difference_noise
 from robot_assets.robot import Robot, linear_joints
 from robot_assets.urdf import read_urdf
 
+BELOW, MOSTLY = 0.3, 0.3  # of the lowest anti-resonance: below, links follow their motors; share of the motion there
+ORDER, ENDS = 3, 0.3  # of the filter that leaves it, and s that it takes to forget the ends of the log
 LIKE = (0.8, 1.25)  # a channel over what tells the same, of one unit and sign
 FOLLOWED = (0.5, 2.0)  # the same of a reference over what follows it
 FREEZE = 0.1  # s: a channel that stands still for longer while the joint moves
+STEPS = 1.5  # counts: a position that takes smaller steps from sample to sample may wait for its next count
+SAME = 1e-9  # of the largest value: signals that differ by less are one
+CHANGES = 10  # of a signal, from which it can be known again
 CLIPPED = 3e-3  # share of the samples at the very largest value, in runs of three or more
 SMOOTH = 1e-5  # torque noise over torque rms, below which a log was filtered
 MOVES = 3.0  # standard deviation of a position over its noise
@@ -56,6 +61,7 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
     v = velocity(s, dataset.sample_rate)
     limits, speeds = robot.array("torque_limit"), robot.array("velocity_limit")
     alike = robot.n > 1 and np.ptp(limits) == 0.0  # one limit of all joints was put in for none
+    motors, links = _below_resonance(s, dataset)
     for j, name in enumerate(dataset.joints):
         m, newton = ("m", "N") if linear[j] else ("rad", "N m")
         q, tau = s.q[:, j], s.tau[:, j]
@@ -87,7 +93,7 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
                 f"tau_{j + 1} ({name}) stays below {top:.3g} {newton}, its limit is {limits[j]:.4g}: current, or torque before the gear?"
             )
         # A loop follows a slow reference as it is, and one near its bandwidth more or less.
-        compared = (("qd", s.qd, v, LIKE), ("q_link", s.q_link, s.q, LIKE), ("q_ref", s.q_ref, s.q, FOLLOWED))
+        compared = (("qd", s.qd, v, LIKE), ("q_link", links, motors, LIKE), ("q_ref", s.q_ref, s.q, FOLLOWED))
         for channel, x, reference, (low, high) in compared:
             if x is None or not np.all(np.isfinite(x[:, j])) or np.ptp(x[:, j]) == 0:
                 continue
@@ -98,6 +104,44 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
                 what = f"the derivative of q_{j + 1}" if channel == "qd" else f"q_{j + 1}"
                 out.append(f"{channel}_{j + 1} ({name}) is {gain:.4g} times {what}: wrong unit or sign?")
     return out
+
+
+def _below_resonance(s: Segment, dataset: Dataset) -> tuple[np.ndarray, np.ndarray | None]:
+    """(N, n) positions of motors and links where these follow those: near its resonance a link swings further.
+
+    A joint that hardly moves so slowly has none of its link.
+    """
+    if s.q_link is None:
+        return s.q, None
+    rate = dataset.sample_rate
+    edge, cut = round(ENDS * rate), min(0.2 * rate, BELOW * float(anti_resonance(s, dataset.robot).min()))
+    if len(s.q) < 3 * edge + 32 or not cut > 0:
+        return s.q, None
+    low = scipy.signal.butter(ORDER, cut / (rate / 2), output="sos")
+    motors = scipy.signal.sosfiltfilt(low, s.q, axis=0)[edge : len(s.q) - edge]
+    told = np.all(np.isfinite(s.q_link), axis=0) & (motors.std(axis=0) > MOSTLY * s.q.std(axis=0))
+    links = scipy.signal.sosfiltfilt(low, np.where(told, s.q_link, 0.0), axis=0)[edge : len(s.q) - edge]
+    return motors, np.where(told, links, np.nan)
+
+
+def identical_warnings(s: Segment, dataset: Dataset) -> list[str]:
+    """Joints of which a channel is that of another joint: no two joints tell the same, down to noise and rounding."""
+    out = []
+    for channel in ("tau", "q", "qd", "q_link"):
+        x = getattr(s, channel)
+        for i in range(dataset.n) if x is not None else ():
+            for k in range(i):
+                if _same(x[:, k], x[:, i]):
+                    first, second = (f"{channel}_{j + 1} ({dataset.joints[j]})" for j in (k, i))
+                    out.append(f"{first} and {second} are identical: one column for two joints?")
+    return out
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two signals are one that changes now and then; what stands still or is not there is nobody's."""
+    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))) or np.sum(np.diff(a) != 0) < CHANGES:
+        return False
+    return bool(np.all(np.abs(a - b) <= SAME * np.abs(a).max()))
 
 
 def _gain(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
@@ -129,8 +173,9 @@ def stuck_warnings(s: Segment, dataset: Dataset) -> list[str]:
                 # A position may rest; one that stops within a sample out of full motion did not.
                 before = np.abs(np.diff(x[max(0, a - 4) : a + 1]))
                 after = np.abs(np.diff(x[b - 1 : b + 4]))
-                usual = 0.3 * np.percentile(np.abs(np.diff(x)), 95)
-                moving = len(before) > 0 and len(after) > 0 and min(before.min(), after.max()) > usual
+                # Nor did one that moves by less than a count from sample to sample.
+                least = max(0.3 * np.percentile(np.abs(np.diff(x)), 95), STEPS * resolution(np.diff(x)))
+                moving = len(before) > 0 and len(after) > 0 and min(before.min(), after.max()) > least
             inside = a > 0 and b < len(x)
             if lengths[k] >= longest and moving and inside:
                 out.append(

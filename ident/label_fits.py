@@ -19,6 +19,8 @@ TELLS = 0.5  # share of a torque left unexplained, above which its joint tells n
 SURE = 4.0  # times as much must be unexplained as recorded,
 AS_GOOD = 2.0  # and with so many times what is left another reading is possible too,
 CLOSE = 0.02  # or with so much more
+LEFT = 0.3  # of the larger one of its parts, that a needed torque must be to tell: descriptions err by less,
+OVER = 4.0  # and times the noise of the recorded torque
 STEP = 0.8  # of what was unexplained, that one more joint read otherwise must leave at most
 
 Reading = tuple[int, int, int]  # sign of the position, sign of the torque, quarter turns added to the position
@@ -34,6 +36,7 @@ class Motion:
 
     Attributes:
         linear: (n,) joints whose position is in m. inertia: (n,) kg m2 or kg of the motors, link side.
+        noise: (n,) of the torques, N m or N.
     """
 
     q: np.ndarray
@@ -44,6 +47,29 @@ class Motion:
     structure: Structure
     linear: np.ndarray
     inertia: np.ndarray
+    noise: np.ndarray
+
+    def telling(self) -> np.ndarray:
+        """(n,) joints whose torque can tell whether it fits.
+
+        A joint that is held while others move needs the difference of what they do to it and of what it yields, and
+        the spring and damper by which its controller holds it take up most: what they leave is the error of a
+        description, or noise.
+        """
+        whole = self.needed(self.q, self.v, self.a)
+        itself = self.of_itself()
+        parts = np.maximum(itself.std(axis=0), (whole - itself).std(axis=0))
+        n = self.q.shape[1]
+        left = np.array([np.std(without(self.own(j, spring=True), whole[:, j])) for j in range(n)])
+        return np.asarray(left > np.maximum(LEFT * parts, OVER * self.noise))
+
+    def of_itself(self) -> np.ndarray:
+        """(N, n) torque that each joint needs for its own acceleration."""
+        model, driven = self.structure.model, self.structure.driven
+        data, full = model.createData(), np.zeros((len(self.q), model.nv))
+        full[:, driven] = self.q
+        links = np.array([np.diag(pin.crba(model, data, q)) for q in full])[:, driven]
+        return (links + self.inertia) * self.a
 
     def needed(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """(N, n) torque that bodies, gravity and motors need."""
@@ -132,7 +158,7 @@ def other_readings(motion: Motion) -> dict[int, tuple[tuple[int, Reading], ...]]
     readings, left = min(
         (end for end in ends if end[1].sum() <= good), key=lambda end: (n - end[0].count(RECORDED), end[1].sum())
     )
-    tells = left < TELLS
+    tells = (left < TELLS) & motion.telling()
     if not np.any(tells) or recorded[tells].sum() < SURE * left[tells].sum():
         return {}
     most = AS_GOOD * left[tells].sum() + CLOSE
@@ -152,7 +178,7 @@ def other_readings(motion: Motion) -> dict[int, tuple[tuple[int, Reading], ...]]
 def motion_of(m: Motion, pick: slice) -> Motion:
     """A motion at some of its instants."""
     q, v, a, tau, turns = (x[pick] for x in (m.q, m.v, m.a, m.tau, m.turns))
-    return Motion(q, v, a, tau, turns, m.structure, m.linear, m.inertia)
+    return Motion(q, v, a, tau, turns, m.structure, m.linear, m.inertia, m.noise)
 
 
 def said_of(j: int, joints: tuple[str, ...], ways: tuple[tuple[int, Reading], ...], slope: float) -> str:

@@ -214,18 +214,23 @@ def _spread(A: np.ndarray, slope: np.ndarray, y: np.ndarray, block: np.ndarray) 
 def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
     """How late the link encoder of each joint comes after its motor encoder, s.
 
-    ``q - q_link = late q' + (M q'' + c + g) / stiffness + lost motion sign(q') + offset``: the gear carries
-    the link, as the URDF has it, and not the friction of the motor.
+    ``q - q_link = late q' + (T + damping T') / stiffness + lost motion sign(q') + offset``: the gear carries
+    ``T = M q_link'' + c + g`` of the links as they move behind their gears, as the URDF has them, and not the friction
+    of the motor. Where motors move in one direction, that their links swing would else look like a skew.
     """
     out, rate = [], dataset.sample_rate
     if s.q_link is None:
         return [UNKNOWN] * dataset.n
-    q, _, v, a = _band(s, rate)
+    _, _, v, _ = _band(s, rate)
     structure, edge = build_structure(dataset.robot), int(rate * SETTLED)
-    data, full = structure.model.createData(), np.zeros((3, len(q), structure.model.nv))
-    for k, x in enumerate((q, v, a)):
+    links = _low(np.where(np.all(np.isfinite(s.q_link), axis=0), s.q_link, s.q), rate)
+    speed = np.gradient(links, 1 / rate, axis=0)
+    a = np.gradient(speed, 1 / rate, axis=0)
+    data, full = structure.model.createData(), np.zeros((3, len(v), structure.model.nv))
+    for k, x in enumerate((links, speed, a)):
         full[k][:, structure.driven] = x
-    carried = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(q))])[:, structure.driven]
+    carried = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(v))])[:, structure.driven]
+    damped = np.gradient(carried, 1 / rate, axis=0)
     for j in range(dataset.n):
         link = s.q_link[:, j]
         keep = np.abs(v[:, j]) > MOVING * np.abs(v[:, j]).max()
@@ -234,7 +239,8 @@ def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
             out.append(UNKNOWN)
             continue
         y = _low(s.q[:, [j]] - link[:, None], rate)[keep, 0]
-        A = np.stack([carried[:, j], a[:, j], np.sign(v[:, j]), np.ones(len(q))], axis=1)[keep]
+        columns = [carried[:, j], damped[:, j], a[:, j], np.sign(v[:, j]), np.ones(len(v))]
+        A = np.stack(columns, axis=1)[keep]
         A = A / np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         slope = v[keep, j]
         block = np.arange(len(y)) * BLOCKS // len(y)

@@ -17,6 +17,7 @@ from ident.chain import build_structure
 from ident.channel_checks import anti_resonance
 from ident.dataset import Dataset, Segment
 from ident.label_fits import Motion, Reading, correlation, other_readings, said_of, without
+from ident.rest import difference_noise
 from robot_assets.robot import linear_joints
 
 SEGMENTS = 6  # of a dataset, that a diagnosis looks at
@@ -44,6 +45,7 @@ class Match:
         correlation: (n, n) of the torque recorded at i with the one needed at j, friction and offset removed.
         slope: (n,) recorded torque over the needed one. size: (n,) rms needed over rms recorded.
         beside_spring: (n,) correlation of the torques of each joint, what is linear in its position removed too.
+        telling: (n,) joints whose torque can tell whether it fits.
         readings: joint -> (joint, signs and zero) that explain the torques, where those recorded do not.
     """
 
@@ -51,6 +53,7 @@ class Match:
     slope: np.ndarray
     size: np.ndarray
     beside_spring: np.ndarray
+    telling: np.ndarray
     readings: dict[int, tuple[tuple[int, Reading], ...]]
 
 
@@ -71,7 +74,8 @@ def match_torques(s: Segment, dataset: Dataset) -> Match | None:
     q, tau, v = q[pick], tau[pick], v[pick]
     robot = dataset.robot
     linear, inertia = np.array(linear_joints(robot)), robot.array("motor_inertia")
-    m = Motion(q, v, a, tau, turns, build_structure(robot), linear, inertia)
+    noise = difference_noise(s.tau) * np.sqrt(2 * cut / rate)  # in the band
+    m = Motion(q, v, a, tau, turns, build_structure(robot), linear, inertia, noise)
     needed = m.needed(q, v, a)
     C, slope, size, beside = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
     for j in range(n):
@@ -82,8 +86,9 @@ def match_torques(s: Segment, dataset: Dataset) -> Match | None:
         length = max(float(np.linalg.norm(need)), 1e-300)
         C[:, j] = need @ got / lengths / length
         slope[j], size[j] = C[j, j] * lengths[j] / length, length / lengths[j]
-    doubtful = np.any((beside < APART) & (size > SEEN)) and not _crossed(C)
-    return Match(C, slope, size, beside, other_readings(m) if doubtful else {})
+    telling = m.telling()
+    doubtful = np.any((beside < APART) & (size > SEEN) & telling) and not _crossed(C)
+    return Match(C, slope, size, beside, telling, other_readings(m) if doubtful else {})
 
 
 def _crossed(C: np.ndarray) -> list[tuple[int, int]]:
@@ -160,7 +165,7 @@ def _doubts(found: Match) -> list[str]:
         out.append(
             f"torques are about {np.median(sure):.2g} times what bodies and motors need: wrong unit, or sample rate?"
         )
-    unlike = found.beside_spring < APART
+    unlike = (found.beside_spring < APART) & found.telling
     strange = (own < APART) & unlike & (found.size > LARGE[0])
     against = (own < AGAINST[0]) & unlike & (found.size > AGAINST[1])
     if np.sum(strange) > 1 or np.any(strange & (found.size > LARGE[1])) or np.any(against):

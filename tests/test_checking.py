@@ -7,9 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.signal
 
 from ident import skew_checks
-from ident.channel_checks import lost_sample_warnings, unit_warnings
+from ident.channel_checks import (
+    anti_resonance,
+    identical_warnings,
+    lost_sample_warnings,
+    stuck_warnings,
+    unit_warnings,
+)
 from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
 from ident.skew_checks import _far_skew as far_skew
@@ -157,6 +164,14 @@ FAULTS = {
         lambda s: replace(s, q=change(s.q, 0, np.negative), qd=None, q_link=None),
         "tau_1 (shoulder_pan_joint) runs against what bodies and motor need, -0.984 times it: wrong sign of tau_1, or of q_1?",
     ),
+    "one torque for two joints": (
+        lambda s: replace(s, tau=s.tau[:, [0, 1, 1, 3, 4, 5]]),
+        "tau_2 (shoulder_lift_joint) and tau_3 (elbow_joint) are identical: one column for two joints?",
+    ),
+    "one position for two joints": (
+        lambda s: replace(s, q=s.q[:, [0, 1, 2, 3, 3, 5]], qd=None, q_link=None),
+        "q_4 (wrist_1_joint) and q_5 (wrist_2_joint) are identical",
+    ),
     "link late": (
         lambda s: replace(s, q_link=np.roll(s.q_link, 2, axis=0)),
         "q_link_1 (shoulder_pan_joint) comes 4 ms after",
@@ -188,6 +203,32 @@ def test_a_fault_is_found(arm, log, fault):
     make, expected = FAULTS[fault]
     found = warnings(arm, make(log))
     assert any(expected in w for w in found), found
+
+
+def test_channels_that_stand_still_are_not_those_of_another_joint(arm, log):
+    still = change(change(log.tau, 1, np.zeros_like), 2, np.zeros_like)
+    assert identical_warnings(replace(log, tau=still), dataset(arm, log)) == []
+
+
+def test_a_position_that_waits_for_its_next_count_does_not_stand_still(arm, log):
+    """It goes to and fro between two counts, and stays on one as long as it is far from the next."""
+    k = np.arange(N)
+    q = change(log.q, 1, lambda x: 1e-4 * np.where((k > 1000) & (k < 1100), 0, k % 2))
+    assert not any("stands still" in w for w in stuck_warnings(replace(log, q=q), dataset(arm, log)))
+
+
+def test_a_link_that_swings_near_its_resonance_has_the_unit_of_its_motor(arm, log):
+    """Whether it moves little else or follows its motor for the most part; degrees are told of the latter."""
+    j, t = 2, log.t
+    hz = 0.6 * anti_resonance(log, arm)[j]
+    for slow, told in ((0.0, False), (0.5, True)):
+        fast, drift = 0.2 * np.sin(2 * np.pi * hz * t), slow * np.sin(2 * np.pi * 0.3 * t)
+        q, q_link = log.q.copy(), log.q.copy()
+        q[:, j], q_link[:, j] = drift + fast, drift + 1.56 * fast
+        s = replace(log, q=q, q_link=q_link, qd=None)
+        assert not any(w.startswith("q_link_3") for w in unit_warnings(s, dataset(arm, s)))
+        s = replace(s, q_link=change(q_link, j, np.rad2deg))
+        assert any(w.startswith("q_link_3 (elbow_joint) is 57") for w in unit_warnings(s, dataset(arm, s))) == told
 
 
 def test_a_wrong_sample_rate_is_found(arm, log):
@@ -484,6 +525,50 @@ def test_a_torque_is_small_beside_limits_that_are_known(arm, log, limit, guessed
     unknown = arm.joint_names if guessed else ()
     placed = replace(arm, joints=joints, guessed=arm.guessed | {"torque_limit": unknown})
     assert any("stays below" in line for line in warnings(placed, log)) == told
+
+
+def test_links_that_swing_behind_motors_of_one_direction_have_no_skew():
+    """Sines on a ramp, in which velocity hardly differs from an offset, up to two thirds of the resonance of the link."""
+    robot, j, anti, damping = load_robot("ur10_bare"), 1, 9.0, 0.004
+    model = pin.buildModelFromUrdf(str(robot.urdf))
+    data, t = model.createData(), np.arange(N) / RATE
+    q_link = np.zeros((N, robot.n))
+    q_link[:, j] = 0.2 * t + 0.02 * scipy.signal.chirp(t, 0.2, t[-1], 6.0) * np.sin(np.pi * t / t[-1]) ** 2
+    v = np.gradient(q_link, t, axis=0)
+    carried = np.array([pin.rnea(model, data, *x) for x in zip(q_link, v, np.gradient(v, t, axis=0))])
+    stiffness = np.diag(pin.crba(model, data, q_link[0])) * (2 * np.pi * anti) ** 2
+    q = q_link + (carried + damping * np.gradient(carried, t, axis=0)) / stiffness
+    noise = 1e-7 * np.random.default_rng(0).normal(size=(2, *q.shape))
+    s = Segment("log", "trajectory", "identification", t, carried, q + noise[0], q_link=q_link + noise[1])
+    for late in (0, 5):
+        found = link_skew(replace(s, q_link=np.roll(s.q_link, late, axis=0)), dataset(robot, s))[j]
+        assert found.late == pytest.approx(late / RATE, abs=1e-4) and found.sure == (late > 0)
+
+
+@pytest.mark.parametrize("hz", [0.3, 6.0])
+def test_a_joint_that_is_held_while_another_moves_tells_nothing_of_its_torque(hz):
+    """It yields to what moves it, softly or stiffly held, beside motors that are a fifth heavier than described."""
+    robot, rng, period, moved = load_robot("ur10_bare"), np.random.default_rng(0), 5000, 1
+    model = pin.buildModelFromUrdf(str(robot.urdf))
+    q0 = np.array([0.0, -1.0, 1.0, 0.3, 0.5, 0.0])
+    M = np.triu(pin.crba(model, model.createData(), q0))
+    M = M + np.triu(M, 1).T + np.diag(1.2 * robot.array("motor_inertia"))
+    spring = np.where(np.arange(6) == moved, 0.0, (2 * np.pi * hz) ** 2 * np.diag(M))
+    spectra = np.zeros((2, period // 2 + 1, 6), complex)
+    for line in range(10, 90):
+        w = 2 * np.pi * line * RATE / period
+        push = np.eye(6)[moved] * np.exp(2j * np.pi * rng.random())
+        hold = np.diag(spring * (1 + 0.03j * w))
+        q = np.linalg.solve(hold + 1j * w * np.diag(robot.array("viscous_friction")) - w**2 * M, push)
+        spectra[:, line] = q, push - hold @ q
+    q, tau = (np.tile(np.fft.irfft(x, period, axis=0), (2, 1)) for x in spectra)
+    size = 0.02 / np.abs(q).max()
+    tau = size * tau + pin.rnea(model, model.createData(), q0, np.zeros(6), np.zeros(6))
+    tau = tau + 1e-4 * robot.array("torque_limit") * rng.normal(size=tau.shape)
+    q = q0 + size * q + 2e-6 * rng.normal(size=q.shape)
+    s = Segment("log", "multisine", "identification", np.arange(len(q)) / RATE, tau, q, period=period, periods=2)
+    assert torque_warnings(s, dataset(robot, s)) == []
+    assert match_torques(s, dataset(robot, s)).telling[moved]
 
 
 def test_steps_of_a_position_are_no_skew(arm):
