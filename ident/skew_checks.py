@@ -33,6 +33,8 @@ GONE = 0.3  # share of what is unexplained without a skew that must go with it,
 NOTHING = 1.5
 SURE = 8.0  # deviations of a skew, of eight stretches of time: one in ten thousand by chance (Student's t)
 ONE_JOINT = 0.5  # share of a skew that may go with one joint
+AGREE = 0.3, 4.0  # share of a skew, and deviations, by which that of each joint may differ from that of all
+STEPS, SETTLES = 10, 1e-5  # of a search for the skews of all joints, and s of its last one
 MOVING = 0.1  # of the largest speed: slower samples are left out, where friction is of another kind
 
 
@@ -59,11 +61,35 @@ def torque_skew(s: Segment, dataset: Dataset) -> Skew:
     of the rigid-body regressor, of motor inertia and of friction. Samples of slow joints, where friction
     has memory, are left out. The deviation is that of a jackknife over ``BLOCKS`` stretches of time. A shift that
     leaves most of what was unexplained, and more than noise, stands for something else, such as a gear with lost
-    motion, and one that is gone without one of the joints is no skew of the channels, but an effect of that joint. It
-    is a cross-correlation in which inertia, gravity and friction have their place.
+    motion, and one that is gone without one of the joints, or that is another one at each of them, is no skew of the
+    channels, but an effect of that joint, or one that follows the motion otherwise. It is a cross-correlation in which
+    inertia, gravity and friction have their place.
     """
     near = _fit(s, dataset, 0.0)
     return near if near is not None else _far_skew(s, dataset)
+
+
+def joint_skews(s: Segment, dataset: Dataset) -> list[Skew]:
+    """How late the torque of each joint comes after the positions, s, all rigid bodies in common; unknown where that
+    does not take nearly all that is unexplained at the joint, and at any joint where some other skew leaves most: that
+    stands for something else, as a floor that shakes."""
+    sums = _sums(s, dataset, SETTLED)
+    if sums is None or dataset.n < 2:
+        return [UNKNOWN] * dataset.n
+    found = _by_joint(sums, dataset.sample_rate, 0.0)
+    taken = found.gone > FAR_GONE
+    seems = [k.sure and abs(k.late) > ODD / dataset.sample_rate for k in found.skews]
+    if np.any(seems & ~taken):
+        return [UNKNOWN] * dataset.n
+    return [k if gone else UNKNOWN for k, gone in zip(found.skews, taken, strict=True)]
+
+
+@dataclass(frozen=True)
+class _ByJoint:
+    """Skews of the torques of all joints, each its own, and the share (n,) of what is unexplained that goes with it."""
+
+    skews: tuple[Skew, ...]
+    gone: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -83,10 +109,13 @@ class _Sums:
     keep: np.ndarray
     every: int
 
-    def torque(self, late: float, rate: float) -> np.ndarray:
-        """(len(pick), n) torque of so many seconds later."""
+    def torque(self, late: float | np.ndarray, rate: float) -> np.ndarray:
+        """(len(pick), n) torque of so many seconds later, of all joints or (n,) of each."""
         time = np.arange(len(self.tau)) / rate
-        return np.stack([np.interp(time[self.pick] + late, time, x) for x in self.tau.T], axis=1) / self.scale
+        shifts = np.broadcast_to(late, self.tau.shape[1])
+        return (
+            np.stack([np.interp(time[self.pick] + k, time, x) for k, x in zip(shifts, self.tau.T)], axis=1) / self.scale
+        )
 
 
 def _sums(s: Segment, dataset: Dataset, margin: float) -> _Sums | None:
@@ -151,7 +180,52 @@ def _fit(s: Segment, dataset: Dataset, start: float, margin: float = SETTLED, le
         )
         if not abs(without - late) < ONE_JOINT * abs(late):
             return UNKNOWN
+    if skew.sure and n > 1 and not _agreed(skew, _by_joint(sums, rate, late).skews):
+        return UNKNOWN
     return skew
+
+
+def _agreed(skew: Skew, own: tuple[Skew, ...]) -> bool:
+    """Whether the skew of all joints is that of each; one that is not known speaks against none."""
+    off = [abs(k.late - skew.late) > max(AGREE[0] * abs(skew.late), AGREE[1] * k.std) for k in own]
+    return not any(off)
+
+
+def _by_joint(sums: _Sums, rate: float, start: float) -> _ByJoint:
+    """Skews of all joints at once, searched for from ``start`` s on; unknown where the search does not settle."""
+    n, rows, pick = sums.tau.shape[1], sums.rows, sums.pick
+    at = np.tile(np.arange(n), len(pick))[rows]
+    block = np.repeat(np.arange(len(pick)) * BLOCKS // len(pick), n)[rows]
+    U, sv, Vt = np.linalg.svd(sums.A[rows], full_matrices=False)
+    kept = sv > RANK * sv[0]
+    U, back = U[:, kept], Vt[kept].T / sv[kept]
+    late, step = np.full(n, start), np.full(n, np.inf)
+    left: list[np.ndarray] = []
+    for _ in range(STEPS):
+        y = sums.torque(late, rate).ravel()[rows]
+        fit = (sums.A @ (back @ (U.T @ y))).reshape(-1, n)
+        slope = np.gradient(fit, sums.every / rate, axis=0).ravel()[rows]
+        C = np.where(at[:, None] == np.arange(n), slope[:, None], 0.0)
+        unexplained = y - U @ (U.T @ y)
+        left.append(np.bincount(at, weights=unexplained**2, minlength=n))
+        step = np.linalg.lstsq(C - U @ (U.T @ C), unexplained, rcond=RANK)[0]
+        late = late - step
+        if np.abs(step).max() < 1e-6 or np.abs(late - start).max() > 2 * LATEST:
+            break
+    whole = np.bincount(at, weights=y**2, minlength=n)
+    W = np.concatenate([U, C], axis=1)
+    squares = np.array([W[block == k].T @ W[block == k] for k in range(BLOCKS)])
+    products = np.array([W[block == k].T @ y[block == k] for k in range(BLOCKS)])
+    parts = np.array(
+        [
+            np.linalg.lstsq(squares.sum(axis=0) - squares[k], products.sum(axis=0) - products[k], rcond=RANK**2)[0][-n:]
+            for k in range(BLOCKS)
+        ]
+    )
+    std = np.sqrt((BLOCKS - 1) / BLOCKS * np.sum((parts - parts.mean(axis=0)) ** 2, axis=0))
+    settled = (np.abs(step) < SETTLES) & (np.abs(late - start) < 1.5 * LATEST) & (left[-1] < (1.0 - EXPLAINED) * whole)
+    skews = tuple(Skew(float(k), float(d)) if ok else UNKNOWN for k, d, ok in zip(late, std, settled, strict=True))
+    return _ByJoint(skews, 1.0 - left[-1] / np.maximum(left[0], 1e-300))
 
 
 def _far_skew(s: Segment, dataset: Dataset) -> Skew:
@@ -275,7 +349,14 @@ def skew_warnings(s: Segment, dataset: Dataset) -> list[str]:
     held = HELD / rate if dataset.input_hold == "zoh" else 0.0
     if s.kind != "trajectory" or len(s.t) < 4 * rate * SETTLED + 100:
         return []
-    named = [("torque", "the positions", torque_skew(s, dataset), -held)]
+    whole = torque_skew(s, dataset)
+    named = [("torque", "the positions", whole, -held)]
+    # Of one joint alone a skew of less than a sample may be much else.
+    named += [
+        (f"tau_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k, -held)
+        for j, k in enumerate([] if whole.sure else joint_skews(s, dataset))
+        if abs(k.late + held) > ODD / rate
+    ]
     named += [
         (f"q_link_{j + 1} ({dataset.joints[j]})", f"q_{j + 1}", k, 0.0) for j, k in enumerate(link_skew(s, dataset))
     ]
@@ -298,6 +379,8 @@ def _said(skew: Skew, usual: float, rate: float) -> bool:
 
 
 def _reason(what: str, late: float, usual: float, rate: float) -> str:
+    if what.startswith("tau_"):
+        return "one of them sampled at another time or filtered, or the drive of this joint late?"
     if abs(late) > LATEST:
         return "channels of clocks that are not in step (shift in [files] of a map moves one)?"
     held = what == "torque" and usual == 0.0 and abs(late * rate + HELD) < SMALL[0]

@@ -20,7 +20,7 @@ from ident.channel_checks import (
 from ident.checking import inspect_dataset
 from ident.dataset import Dataset, Segment
 from ident.skew_checks import _far_skew as far_skew
-from ident.skew_checks import link_skew, skew_warnings, torque_skew
+from ident.skew_checks import joint_skews, link_skew, skew_warnings, torque_skew
 from ident.torque_checks import contradictions, match_torques, torque_warnings
 from robot_assets.robot import load_robot
 
@@ -357,11 +357,35 @@ def test_one_joint_whose_torque_comes_late_is_no_skew_of_the_channels():
     tau = s.tau.copy()
     shift = round(0.012 * dataset(robot, s).sample_rate)
     tau[shift:, 2] = s.tau[:-shift, 2]
-    assert not torque_skew(replace(s, tau=tau), dataset(robot, s)).sure
+    late = replace(s, tau=tau)
+    assert not torque_skew(late, dataset(robot, s)).sure
+    said = [w for w in skew_warnings(late, dataset(robot, s)) if not w.startswith("q_link")]
+    assert len(said) == 1 and said[0].startswith("tau_3 (elbow_joint) comes 12 ms after q_3")
     whole = s.tau.copy()
     whole[shift:] = s.tau[:-shift]
     found = torque_skew(replace(s, tau=whole), dataset(robot, s))
     assert found.sure and found.late == pytest.approx(0.012, abs=1e-3)
+
+
+def test_torques_late_by_another_time_each_have_no_skew_in_common():
+    robot = load_robot("ur10_bare")
+    s = recording(robot, np.random.default_rng(7))
+    lates = [6, 5, 4, 5, 6, 2]  # samples
+    s = replace(s, tau=np.stack([np.roll(x, k) for x, k in zip(s.tau.T, lates)], axis=1))
+    assert not torque_skew(s, dataset(robot, s)).sure
+    for k, late in zip(joint_skews(s, dataset(robot, s)), lates):
+        assert k.late == pytest.approx(late / RATE, abs=1e-3) or np.isnan(k.late)
+
+
+def test_a_late_joint_is_told_of_none_where_others_seem_late_and_are_not(monkeypatch):
+    robot = load_robot("ur10_bare")
+    s = recording(robot, np.random.default_rng(7))
+    s = replace(s, tau=change(s.tau, 2, lambda x: np.roll(x, 6)))
+    sure, gone = skew_checks.Skew(0.012, 1e-5), np.array([0.0, 0.0, 1.0, 0.0, 0.5, 0.0])
+    for other, told in ((skew_checks.UNKNOWN, [2]), (skew_checks.Skew(-0.01, 1e-3), [])):
+        skews = tuple({2: sure, 4: other}.get(j, skew_checks.UNKNOWN) for j in range(6))
+        monkeypatch.setattr(skew_checks, "_by_joint", lambda *_, x=skews: skew_checks._ByJoint(x, gone))
+        assert [j for j, k in enumerate(joint_skews(s, dataset(robot, s))) if k.sure] == told
 
 
 def test_longer_and_longer_steps_are_no_lost_samples():
