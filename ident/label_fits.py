@@ -22,6 +22,11 @@ CLOSE = 0.02  # or with so much more
 LEFT = 0.3  # of the larger one of its parts, that a needed torque must be to tell: descriptions err by less,
 OVER = 4.0  # and times the noise of the recorded torque
 STEP = 0.8  # of what was unexplained, that one more joint read otherwise must leave at most
+ZEROS = np.linspace(-1.2, 1.2, 17)  # rad, about which another zero of a joint is looked for,
+CUTS, FEW = 10, 100  # cuts of such a step by a third, and instants looked at
+MOVED = 0.1  # rad by which it must differ,
+OF_WHOLE = 0.02  # share of their torques, summed over joints, that must be unexplained as recorded,
+ONLY = 0.1, 3.0  # share of that which it may leave, and times as much that any other joint leaves at least
 
 Reading = tuple[int, int, int]  # sign of the position, sign of the torque, quarter turns added to the position
 RECORDED: Reading = (1, 1, 0)
@@ -173,6 +178,53 @@ def other_readings(motion: Motion) -> dict[int, tuple[tuple[int, Reading], ...]]
             whole = [(j, one) for one, x in uniform.items() if len(set(readings)) == 1 and x[tells].sum() <= most]
             out[j] = tuple(dict.fromkeys([*good, *whole]))
     return out
+
+
+def other_zero(motion: Motion) -> tuple[int, float] | None:
+    """The joint of which another zero explains the torques, which those recorded do not, and rad to add to its position.
+
+    Friction, an offset and the inertia of the motor of each joint are left free; what is known of the bodies is not.
+    """
+    m = motion_of(motion, slice(None, None, max(1, len(motion.q) // FEW)))
+    recorded = _unlike(m, 0, 0.0)
+    if recorded.sum() < OF_WHOLE:
+        return None
+    found = {j: _best_zero(m, j) for j in range(m.q.shape[1]) if not m.linear[j]}
+    left = {j: _unlike(m, j, added) for j, added in found.items()}
+    if not found:
+        return None
+    best = min(left, key=lambda j: left[j].sum())
+    tells = left[best] < TELLS
+    rest = float(left[best][tells].sum())
+    alone = all(left[j][tells].sum() > ONLY[1] * rest for j in left if j != best)
+    sure = alone and abs(found[best]) > MOVED and rest < ONLY[0] * recorded[tells].sum()
+    return (best, found[best]) if sure else None
+
+
+def _best_zero(m: Motion, j: int) -> float:
+    """What to add to the position of joint j, rad, for the least to be unexplained."""
+
+    def unlike(added: float) -> float:
+        return float(_unlike(m, j, added).sum())
+
+    k = int(np.argmin([unlike(x) for x in ZEROS]))
+    low, high = ZEROS[max(k - 1, 0)], ZEROS[min(k + 1, len(ZEROS) - 1)]
+    for _ in range(CUTS):
+        a, b = low + (high - low) / 3, high - (high - low) / 3
+        low, high = (low, b) if unlike(a) < unlike(b) else (a, high)
+    return float(low + high) / 2
+
+
+def _unlike(m: Motion, j: int, added: float) -> np.ndarray:
+    """(n,) share of each torque that is unexplained with so many rad added to the position of joint j."""
+    q = m.q.copy()
+    q[:, j] += added
+    needed, out = m.needed(q, m.v, m.a), []
+    for i in range(q.shape[1]):
+        free = np.column_stack([m.own(i), m.a[:, i]])
+        got = without(free, m.tau[:, i])
+        out.append(np.sum((got - without(free, needed[:, i])) ** 2) / max(float(np.sum(got**2)), 1e-300))
+    return np.array(out)
 
 
 def motion_of(m: Motion, pick: slice) -> Motion:

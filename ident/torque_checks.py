@@ -16,7 +16,7 @@ import scipy.signal
 from ident.chain import build_structure
 from ident.channel_checks import anti_resonance
 from ident.dataset import Dataset, Segment
-from ident.label_fits import Motion, Reading, correlation, other_readings, said_of, without
+from ident.label_fits import Motion, Reading, correlation, other_readings, other_zero, said_of, without
 from ident.rest import difference_noise
 from robot_assets.robot import linear_joints
 
@@ -59,7 +59,13 @@ class Match:
 
 def match_torques(s: Segment, dataset: Dataset) -> Match | None:
     """None where the segment is too short or nothing moves."""
-    rate, n = dataset.sample_rate, dataset.n
+    m = _motion(s, dataset)
+    return None if m is None else _match(m)
+
+
+def _motion(s: Segment, dataset: Dataset) -> Motion | None:
+    """Positions and torques of a segment in the band in which links follow their motors."""
+    rate = dataset.sample_rate
     edge = int(rate * SETTLED) + 1
     every = max(1, (len(s.q) - 2 * edge) // LONGEST)
     pick = np.arange(edge, len(s.q) - edge, every)
@@ -75,8 +81,11 @@ def match_torques(s: Segment, dataset: Dataset) -> Match | None:
     robot = dataset.robot
     linear, inertia = np.array(linear_joints(robot)), robot.array("motor_inertia")
     noise = difference_noise(s.tau) * np.sqrt(2 * cut / rate)  # in the band
-    m = Motion(q, v, a, tau, turns, build_structure(robot), linear, inertia, noise)
-    needed = m.needed(q, v, a)
+    return Motion(q, v, a, tau, turns, build_structure(robot), linear, inertia, noise)
+
+
+def _match(m: Motion) -> Match:
+    n, tau, needed = m.q.shape[1], m.tau, m.needed(m.q, m.v, m.a)
     C, slope, size, beside = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
     for j in range(n):
         need, got = without(m.own(j), needed[:, j]), without(m.own(j), tau)
@@ -118,10 +127,23 @@ def mislabelled(dataset: Dataset) -> list[str]:
 
 def torque_warnings(s: Segment, dataset: Dataset) -> list[str]:
     """Signs, sizes and order of torques that the motion cannot have asked for."""
-    found = match_torques(s, dataset)
+    m = _motion(s, dataset)
+    if m is None:
+        return []
+    found = _match(m)
+    return list(contradictions(found, dataset.joints).values()) or _zero(m, s, dataset.joints) or _doubts(found)
+
+
+def _zero(m: Motion, s: Segment, joints: tuple[str, ...]) -> list[str]:
+    """Another zero of one joint; of motions only, along which gravity changes."""
+    found = other_zero(m) if s.kind == "trajectory" else None
     if found is None:
         return []
-    return list(contradictions(found, dataset.joints).values()) or _doubts(found)
+    j, added = found
+    return [
+        f"the torques do not fit what bodies and motors need, which they do with {added:.2g} rad added to q_{j + 1} ({joints[j]}):"
+        " another zero, or a centre of mass elsewhere in its links?"
+    ]
 
 
 def contradictions(found: Match, joints: tuple[str, ...]) -> dict[tuple[int, str], str]:

@@ -497,6 +497,18 @@ def test_another_zero_of_a_joint_that_gravity_loads_is_told(quarter):
     assert f"{90 * quarter} degrees added to q_4" in said and said.endswith("another zero?")
 
 
+@pytest.mark.parametrize(("name", "joint"), [("ur10_bare", 1), ("panda_bare", 3)])
+def test_a_zero_that_is_a_little_off_is_told_beside_motors_that_are_not_known(name, joint):
+    robot = load_robot(name)
+    s = recording(robot, np.random.default_rng(1))
+    acceleration = np.gradient(s.qd, 1 / RATE, axis=0)
+    s = replace(s, tau=s.tau - 0.3 * robot.array("motor_inertia") * acceleration, qd=None, q_link=None)
+    off = replace(s, q=change(s.q, joint, lambda x: x - 0.25))
+    (said,) = torque_warnings(off, dataset(robot, s))
+    assert f"with 0.25 rad added to q_{joint + 1} (" in said and "another zero, or a centre of mass" in said
+    assert torque_warnings(s, dataset(robot, s)) == []
+
+
 def test_what_several_readings_explain_is_told_of_none_alone():
     """To turn the axes before and after by half a turn mirrors the one between, and the first one bears no gravity."""
     robot = load_robot("panda_bare")
