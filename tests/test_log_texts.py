@@ -77,10 +77,42 @@ def test_a_log_of_texts_alone_is_said_to_be(tmp_path):
 
 
 def test_commas_that_part_thousands_are_no_decimal_signs(tmp_path):
-    for cell in ("1,234", "1,234.5", "1,234,567"):
+    for cell in ("1,234", "1,234,567"):
         log = written(tmp_path, [f'5,"{cell}"'] * 50)
-        with pytest.raises(DataError, match=cell.replace(".", r"\.")):
+        with pytest.raises(DataError, match=cell):
             converted(log)
+
+
+@pytest.mark.parametrize(
+    ("cell", "value"),
+    [("{:,.0f}", np.round(4e4 * X)), ("{:,.3f}", np.round(4e4 * X, 3)), ("{:,.0f}", np.round(4e6 * X)), ("{:.3f}", X)],
+)
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_signs_between_thousands_are_known_by_the_decimal_sign_of_the_log(tmp_path, cell, value, decimal):
+    def local(text):
+        return text.translate(str.maketrans(",.", ".,")) if decimal == "," else text
+
+    log = written(tmp_path, [f"{local(f'{u:.6f}')};{local(cell.format(x))}" for u, x in zip(X, value)], "u;x")
+    assert np.array_equal(converted(log).q[:, 0], np.round(value, 3)) and np.array_equal(converted(log).tau[:, 0], X)
+    assert np.array_equal(survey_log(log).signals["x"], np.round(value, 3)) and not survey_log(log).doubts
+
+
+@pytest.mark.parametrize(("decimal", "other"), [(".", ","), (",", ".")])
+def test_a_sign_that_may_be_one_of_thousands_or_of_decimals_is_an_error(tmp_path, decimal, other):
+    cells = [f"{k % 90 + 10}{other}{k % 900 + 100}" for k in range(N)]
+    log = written(tmp_path, [f"0{decimal}{k % 7};{c}" for k, c in enumerate(cells)], "u;x")
+    with pytest.raises(DataError, match=rf"x = '10\{other}100' in row 1, where decimals stand behind '\{decimal}'"):
+        converted(log)
+    assert survey_log(log).doubts == {"x": f"'10{other}100' in row 1"}
+    other_way = written(tmp_path, [f"0{decimal}{k % 7};0{other}{k % 7}" for k in range(N)], "u;x")
+    assert np.array_equal(*(getattr(converted(other_way), channel) for channel in ("q", "tau")))
+
+
+def test_thousands_after_which_decimals_follow_are_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr("ident.convert.texts.PIECE", 1000)  # of the log, which is read piece by piece
+    cells = [f"{k}" if k < 1000 else "1.500" if k < 2000 else "0.25" for k in range(N)]
+    with pytest.raises(DataError, match=r"x = '0\.25' in row 2001"):
+        converted(written(tmp_path, [f"0,{k % 7};{c}" for k, c in enumerate(cells)], "u;x"))
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,17 @@ THOUSANDS = r"^\s*[+-]?[1-9]\d?\d?(,\d\d\d)+\s*$"
 FORTRAN = r"^([+-]?[0-9.]+)[dD]([+-]?[0-9]+)$"  # an exponent of its double precision
 LABELLED, MOST_LABELS = 10_000, 100  # cells that tell what a column of texts holds, as many kinds as joints
 SEVERAL_COMMAS = r",.*,"
+OTHER = {",": ".", ".": ","}
+# By the decimal sign of a text: numbers with the other sign between their thousands; and what shows that it stands
+# there: two of them, a decimal sign behind one, or a number below a thousand without one.
+GROUPED = {
+    ",": r"^\s*[+-]?[1-9]\d?\d?(\.\d\d\d)+(,\d*)?\s*$",
+    ".": r"^\s*[+-]?[1-9]\d?\d?(,\d\d\d)+(\.\d*)?\s*$",
+}
+SHOWN = {
+    ",": r"^\s*[+-]?(\d+\.\d+\.[\d.]+(,\d*)?|[\d.]+,\d*|\d{1,3})\s*$",
+    ".": r"^\s*[+-]?(\d+,\d+,[\d,]+(\.\d*)?|[\d,]+\.\d*|\d{1,3})\s*$",
+}
 
 
 class Cells:
@@ -30,14 +41,17 @@ class Cells:
         labels: distinct texts of its first cells, where they are no numbers and few.
     """
 
-    def __init__(self, name: str, path: Path, wanted: bool, quoted: bool) -> None:
-        """``wanted``: whether a text is an error. ``quoted``: whether a comma within a cell stood in quotes."""
-        self.name, self.path, self.wanted, self.quoted = name, path, wanted, quoted
+    def __init__(self, name: str, path: Path, wanted: bool, quoted: bool, decimal: str = "") -> None:
+        """``wanted``: whether a text is an error. ``quoted``: whether a comma within a cell stood in quotes.
+        ``decimal``: sign of the decimals of the whole text; empty where that is not plain."""
+        self.name, self.path, self.wanted, self.quoted, self.decimal = name, path, wanted, quoted, decimal
         self.kind, self.rows, self.like, self.order = "", 0, "", ("ymd", False)
         self.comma = self.dot = False
         self.fault: tuple[int, str] | None = None
         self.labels: tuple[str, ...] = ()
         self._parts: list[np.ndarray] = []
+        self._grouped: tuple[int, str] | None = None  # (row, text) of the first with a sign between its thousands
+        self._shown = self._pointed = False  # whether a cell shows that these are thousands; that they are none
 
     def take(self, column: pa.Array) -> None:
         """Take the next cells.
@@ -57,6 +71,19 @@ class Cells:
                 self._refuse(column)
         self.rows += len(column)
 
+    def end(self) -> None:
+        """Say, of all cells, whether signs between their digits may be decimal ones as well as between thousands.
+
+        Raises:
+            DataError: where they may, and are wanted.
+        """
+        if self._grouped is None or self._shown or self.kind != "numbers":
+            return
+        row, text = self.fault = self._grouped
+        if self.wanted:
+            found = f"{self.name} = {text[:60]!r} in row {row}, where decimals stand behind {self.decimal!r} elsewhere"
+            raise DataError("signal", str(self.path), found, "one decimal sign, and no sign between thousands")
+
     def array(self) -> np.ndarray | None:
         """(N,) what was taken; None where it was texts, or nothing."""
         if not self.kind or self.kind == "texts":
@@ -75,13 +102,15 @@ class Cells:
         return parse_dates(column, self.like, self.order)
 
     def _numbers(self, column: pa.Array) -> np.ndarray:
+        column = self._without_thousands(column) if self.decimal == "," else column
         if not self.comma:
             try:
                 out = _cast(column)
                 self.dot = self.dot or bool(pc.any(pc.match_substring(column, ".")).as_py())
                 return out
             except pa.ArrowInvalid:
-                pass
+                if self.decimal == "." and (plain := self._without_thousands(column)) is not column:
+                    return _cast(plain)
         # A comma is the decimal sign where no point is; in quotes it may also part thousands.
         if (
             self.dot
@@ -92,6 +121,7 @@ class Cells:
         commas = column.filter(pc.match_substring(column, ",").fill_null(False))
         if (
             self.quoted
+            and self.decimal != ","
             and not self.comma
             and len(commas)
             and pc.all(pc.match_substring_regex(commas, THOUSANDS)).as_py()
@@ -100,6 +130,30 @@ class Cells:
         out = _cast(pc.replace_substring(column, ",", "."))
         self.comma = True
         return out
+
+    def _without_thousands(self, column: pa.Array) -> pa.Array:
+        """Cells without the sign between thousands, where all that have another sign than that of the decimals of the
+        text are written so; else as they are.
+
+        Raises:
+            ValueError: where some are and others are not.
+        """
+        other = OTHER[self.decimal]
+        signed = column.filter(pc.match_substring(column, other).fill_null(False))
+        if not len(signed) or self._pointed:
+            return column
+        if not pc.all(pc.match_substring_regex(signed, GROUPED[self.decimal])).as_py():
+            if self._grouped is not None:
+                raise ValueError("thousands above, but not here")
+            self._pointed = True  # a column with decimals of its own
+            return column
+        self._grouped = self._grouped or (self.rows + pc.index(column, signed[0]).as_py() + 1, _text(signed[0]).strip())
+        self._shown = (
+            self._shown
+            or bool(pc.any(pc.match_substring_regex(column, SHOWN[self.decimal])).as_py())
+            or any(bool(np.any(np.abs(part) < 1000)) for part in self._parts)
+        )
+        return pc.replace_substring(column, other, "")
 
     def _refuse(self, column: pa.Array) -> None:
         """Of cells that are not all like those above: an error, or texts; a few among numbers are none, and told."""
@@ -111,10 +165,16 @@ class Cells:
             if not np.any(bad):
                 bad[self._no_date(column)] = True
         else:
-            plain = (
-                pc.replace_substring(column, ",", ".") if self.comma or (not self.dot and not self.quoted) else column
-            )
+            plain = column
+            if self._grouped is not None:
+                grouped = pc.match_substring_regex(column, GROUPED[self.decimal])
+                plain = pc.if_else(grouped, pc.replace_substring(column, OTHER[self.decimal], ""), column)
+            if self.comma or (not self.dot and not self.quoted):
+                plain = pc.replace_substring(plain, ",", ".")
             bad = ~pc.match_substring_regex(plain, NUMBER).fill_null(True).to_numpy(zero_copy_only=False)
+            if self._grouped is not None and not np.any(bad):
+                bad = pc.match_substring(column, OTHER[self.decimal]).fill_null(False).to_numpy(zero_copy_only=False)
+                bad &= ~grouped.fill_null(True).to_numpy(zero_copy_only=False)
         index = int(np.argmax(bad))
         row, text = self.rows + index + 1, _text(column[index]).strip()
         first = text == self.like and not any(np.any(~np.isnan(p)) for p in self._parts)

@@ -7,6 +7,7 @@ import csv
 import itertools
 import re
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,9 @@ MOST_COMMENTS = 100_000  # lines before the header
 LONGEST_LINE = 1 << 20  # characters of one
 PAIRED_TIME = "Time"  # as columns of time before each channel are called, which have no name
 BRACKETED = re.compile(r"\[(.+?)\]")
+# A number with decimals, and the sign before them; and one whose sign may as well stand between thousands.
+DECIMALS = re.compile(r"(?i)[+-]?(?:\d*([.,])\d+|\d+(?:[.,]\d{3})+([.,])\d*)(?:[ed][+-]?\d+)?$")
+THREE = re.compile(r"[+-]?[1-9]\d{0,2}([.,])\d{3}(?:\1\d{3})*$")
 NONE = ("na", "n/a", "#n/a", "null")
 ENCODING_BYTES = 1 << 16  # of a text that say how it is encoded
 
@@ -33,6 +37,7 @@ class Layout:
         encoding: of Python. delimiter: one character, or None for blanks.
         names: of the columns; empty where no line says them. units: as written below the names, or empty.
         start: lines before the first row. columns: of a row.
+        decimal: sign of the decimals, "." or ","; empty where the first rows have both, or none that is plain.
     """
 
     encoding: str
@@ -41,6 +46,7 @@ class Layout:
     units: tuple[str, ...]
     start: int
     columns: int
+    decimal: str = ""
 
 
 def read_layout(path: Path) -> Layout:
@@ -69,7 +75,8 @@ def read_layout(path: Path) -> Layout:
     pairs = _pairs(rows)
     if pairs is not None:
         names, units, start = pairs
-        return Layout(encoding, "\t", names, units, skipped + start, len(names))
+        decimal = _decimal(w for r in rows[start:] for w in _words(r, "\t"))
+        return Layout(encoding, "\t", names, units, skipped + start, len(names), decimal)
     above = _header(rows)
     comments.extend(r for r in rows[:above] if _comment(r))
     rows, skipped = rows[above:], skipped + above
@@ -96,7 +103,7 @@ def read_layout(path: Path) -> Layout:
     if names and written and all(_as_many(len(names), w) for w in written):
         columns = len(written[0])  # a delimiter may stand at the end of rows, or of the header, alone
         names = (*names, "")[:columns]
-    return Layout(encoding, delimiter, names, units, start, columns)
+    return Layout(encoding, delimiter, names, units, start, columns, _decimal(w for row in written for w in row))
 
 
 def _header(rows: list[str]) -> int:
@@ -143,6 +150,12 @@ def _pairs(rows: list[str]) -> tuple[tuple[str, ...], tuple[str, ...], int] | No
 def _as_many(n: int, words: tuple[str, ...]) -> bool:
     """Whether a row has ``n`` words, or one more or less that is empty: a delimiter may stand at the end of either."""
     return len(words) == n or (len(words) == n + 1 and not words[-1]) or len(words) == n - 1
+
+
+def _decimal(words: Iterable[str]) -> str:
+    """The only sign behind which decimals stand for sure in words: no three digits that may be thousands do."""
+    found = {m[1] or m[2] for w in words if (m := DECIMALS.match(w)) and not THREE.match(w)}
+    return found.pop() if len(found) == 1 else ""
 
 
 def _encoding(path: Path) -> str:

@@ -53,13 +53,15 @@ def scan_text(path: Path, wanted: set[str] | None) -> list[Cells]:
     else:
         keep = {i: str(i) for i in range(layout.columns)} if wanted is None or VALUES in wanted else {}
     every = wanted is not None or not layout.names
-    cells = {i: Cells(name, path, every, layout.delimiter == ",") for i, name in keep.items()}
+    cells = {i: Cells(name, path, every, layout.delimiter == ",", layout.decimal) for i, name in keep.items()}
     for batch in _batches(path, layout, list(keep)) if keep else ():
         for i, column in cells.items():
             column.take(batch.column(str(i)))
         rows = next(iter(cells.values())).rows
         if wanted is None and (rows * len(cells) > MOST_CELLS or all(c.kind == "texts" for c in cells.values())):
             break
+    for column in cells.values():
+        column.end()
     return list(cells.values())
 
 
