@@ -14,6 +14,7 @@ from ident.convert.clock import (
     Stamps,
     at_times,
     changed,
+    check_order,
     check_rows,
     check_stamps,
     resample,
@@ -184,13 +185,18 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
             if len(other) != N:
                 raise DataError(source, str(path), f"{len(other)} values", f"one for each of {N} samples")
             seconds = seconds + stamp_seconds(other, factor, other[0])
-        clock = check_stamps(seconds, m.sample_rate, path)
-        check_rows(clock, channels["q"], path)
-        clocks, t = [clock], uniform_times(0.0, float(clock.t[-1]), m.sample_rate)
-        if not at_times(clock, t, m.sample_rate):
+        check_order(seconds, path)
+        check_rows(seconds, channels["q"], path)
+        clock = check_stamps(seconds, m.sample_rate, path, [v for k, v in channels.items() if k != "q_link"])
+        if clock.rounded:
+            say(f"{path.name}: {clock.told()}")
+        clocks, start = [clock], float(clock.t[0])
+        at = uniform_times(start, float(clock.t[-1]), m.sample_rate)
+        t = np.arange(len(at)) / m.sample_rate
+        if not at_times(clock, at, m.sample_rate):
             rows = np.concatenate([v for k, v in channels.items() if k != "q_link"], axis=1)
             say(f"{path.name}: {changed(clock, rows, len(t), m.sample_rate)}")
-            channels = {k: resample(v, clock, t, m.sample_rate) for k, v in channels.items()}
+            channels = {k: resample(v, clock, at, m.sample_rate) for k, v in channels.items()}
     return [
         replace(s, filled=_filled(clocks, start + s.t[0], start + s.t[-1]))
         for s in _cut(name, path, m, t, channels, data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import scipy.interpolate
 import scipy.signal
 
 from ident.convert.dates import seconds
+from ident.convert.rounding import even_rows
 from ident.dataset import Filled
 from robot_assets.errors import DataError
 
@@ -32,12 +34,20 @@ class Stamps:
     Attributes:
         t: (N,) s, not falling. rate: Hz, of the log, by the median of its steps.
         starts, ends: (G,) s, samples about the gaps.
+        rounded: s, by which the stamps of the log are rounded: ``t`` are even times then; 0 where they are as they were.
     """
 
     t: np.ndarray
     rate: float
     starts: np.ndarray
     ends: np.ndarray
+    rounded: float = 0.0
+
+    def told(self) -> str:
+        """What was done to rounded stamps, in words; empty where they are none."""
+        if not self.rounded:
+            return ""
+        return f"stamps rounded to {self.rounded * 1e3:.4g} ms: its {len(self.t)} rows put at even times, {self.rate:.6g} Hz"
 
     def filled(self, start: float, end: float) -> Filled | None:
         """The gaps that reach into a stretch of time, s; None where there are none."""
@@ -63,12 +73,8 @@ def changed(clock: Stamps, rows: np.ndarray, N: int, rate: float) -> str:
     )
 
 
-def check_stamps(t: np.ndarray, rate: float, path: Path) -> Stamps:
-    """Stamps (N,), s, for a dataset of ``rate`` Hz.
-
-    Raises:
-        DataError: where they are not finite, go back, have a gap too long to be filled, or are in another unit.
-    """
+def check_order(t: np.ndarray, path: Path) -> None:
+    """Raise a DataError where stamps (N,), s, are not finite or go back."""
     step = np.diff(t)
     bad = np.flatnonzero(~np.isfinite(t))
     if len(bad):
@@ -80,6 +86,21 @@ def check_stamps(t: np.ndarray, rate: float, path: Path) -> Stamps:
         k, more = int(back[0]), f", {len(back)} times in all" if len(back) > 1 else ""
         found = f"a stamp that goes back by {-step[k]:.6g} s at sample {k + 1}{more}"
         raise DataError("time", str(path), found, "rising time stamps: cut the log into two where it begins anew")
+
+
+def check_stamps(t: np.ndarray, rate: float, path: Path, signals: Sequence[np.ndarray] = ()) -> Stamps:
+    """Stamps (N,), s, for a dataset of ``rate`` Hz; even times where they are those, rounded.
+
+    Args:
+        signals: (N, k) each, that tell whether the rows are even.
+
+    Raises:
+        DataError: where they are not finite, go back, have a gap too long to be filled, or are in another unit.
+    """
+    check_order(t, path)
+    even = even_rows(t, signals, 1 / rate)
+    t = t if even is None else even.t
+    step = np.diff(t)
     span = t[-1] - t[0]
     if span * rate > LONGEST * len(t) or span * rate < len(t) / LONGEST:
         found = f"{len(t)} samples over {span:.4g} s"
@@ -87,15 +108,15 @@ def check_stamps(t: np.ndarray, rate: float, path: Path) -> Stamps:
     if step.size and step.max() > max(LONGEST_GAP, 2.0 / rate):
         found = f"{step.max():.4g} s without a sample after {t[int(np.argmax(step))] - t[0]:.4g} s"
         raise DataError("time", str(path), found, f"gaps of at most {LONGEST_GAP:g} s: cut the log into two there")
-    usual = float(np.median(step[step > 0])) if np.any(step > 0) else 1 / rate
+    usual = even.step if even is not None else float(np.median(step[step > 0])) if np.any(step > 0) else 1 / rate
     long = step > GAP * max(usual, 1 / rate)
-    return Stamps(t, 1 / usual, t[:-1][long], t[1:][long])
+    return Stamps(t, 1 / usual, t[:-1][long], t[1:][long], 0.0 if even is None else even.by)
 
 
-def check_rows(stamps: Stamps, q: np.ndarray, path: Path) -> None:
-    """Raise a DataError where rows of one stamp hold positions q (N, n) of several joints: they differ by far more than
-    a joint moves from stamp to stamp, and not as where a clock is coarse."""
-    same = np.diff(stamps.t) == 0
+def check_rows(t: np.ndarray, q: np.ndarray, path: Path) -> None:
+    """Raise a DataError where rows of one stamp (N,) hold positions q (N, n) of several joints: they differ by far more
+    than a joint moves from stamp to stamp, and not as where a clock is coarse."""
+    same = np.diff(t) == 0
     if not np.sum(same) > OF_JOINTS * len(same):
         return
     first = q[np.concatenate([[True], ~same])]

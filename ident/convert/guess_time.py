@@ -10,11 +10,14 @@ import numpy as np
 
 from ident.convert.guess_units import NAMED_UNITS, Family
 from ident.convert.quantities import KINDS, UNITS
+from ident.convert.rounding import Rounded, even_rows
 
 RATES = (20.0, 50e3)  # Hz: a log of an arm is mostly sampled between
 SLOWEST, FASTEST = 0.1, 1e6  # Hz: no log of an arm is sampled beyond
 SLOW = 5.0  # Hz, from which on a log in s is likelier than one in ms of a thousand times the rate
 SHORT = 2.0  # s: a log that is shorter is likelier in another unit
+DRIFT = 1e-4  # of a rate, by which clocks are apart
+TWICE = 0.01  # of the rows, at the time of the one before, from which on that is said
 SECONDS = tuple(KINDS["time"])
 TIMES = (
     "t", "time", "times", "stamp", "timestamp", "zeit", "zeitstempel", "uhrzeit", "datum", "date", "datetime", "elapsed", "duration", "clock", "epoch",
@@ -95,7 +98,8 @@ def find_time(
         # One that mostly rises is the time all the same, and told to be damaged; others only have such a name.
         if trouble and np.mean(step > 0) < 0.9:
             continue
-        median = float(np.median(step[step > 0]))
+        even = None if trouble else even_rows(t, [x for k, x in signals.items() if k not in names])
+        median = float(np.median(step[step > 0])) if even is None else even.step
         named = (
             "s"
             if plus or date
@@ -110,13 +114,16 @@ def find_time(
         if not SLOWEST <= rate <= FASTEST:
             trouble = trouble or f"has steps of {median:.3g}, which is no rate of a log in any unit"
             rate = 0.0
-        rounded = _round_rate(rate, 0.05 if np.ptp(step) > 0.1 * median else 5e-3) if rate else None
+        jitter = 0.05 if np.ptp(step) > 0.1 * median else 5e-3
+        rounded = _round_rate(rate, jitter if even is None else max(even.by / np.ptp(t), DRIFT)) if rate else None
         shown = "" if date else unit
         if trouble:
             if lost is None or key < lost[0]:
                 lost = key, FoundTime(rate=rounded, lost=(f.name, shown, trouble))
         elif best is None or key < best[0]:
-            doubt = "; ".join(d for d in (doubt, *(f"EDIT? {doubts[n]}" for n in sorted(names) if n in doubts)) if d)
+            stamps = _coarse(step, even, "s" if date else unit, rounded)
+            told = (doubt, *(f"EDIT? {doubts[n]}" for n in sorted(names) if n in doubts), stamps)
+            doubt = "; ".join(d for d in told if d)
             best = (
                 key,
                 FoundTime(f.name, shown, plus, t, rounded, doubt.replace(" Hz if in", f" Hz if {f.name} is in", 1)),
@@ -128,6 +135,17 @@ def find_time(
         if power is not None and x.size == 1 and x.item() > 0 and RATES[0] <= x.item() ** power <= RATES[1]:
             return FoundTime(rate=_round_rate(float(x.item() ** power), 1e-6), lost=lost[1].lost if lost else None)
     return lost[1] if lost else FoundTime()
+
+
+def _coarse(step: np.ndarray, even: Rounded | None, unit: str, rate: float | None) -> str:
+    """What is doubtful about stamps that are coarser than the rows, in words."""
+    if even is not None:
+        by = even.by * UNITS[unit]
+        return f"EDIT? stamps rounded to {by * 1e3:.4g} ms: {rate:g} Hz by rows over span, at even times"
+    same = int(np.sum(step == 0))
+    if same < TWICE * len(step):
+        return ""
+    return f"EDIT? {same} of {len(step) + 1} rows at the time of the one before, of which only the first is taken"
 
 
 def _named(f: Family) -> bool:

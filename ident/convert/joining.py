@@ -30,11 +30,18 @@ def on_one_clock(
             raise DataError(f"{f.prefix}:{f.time}", str(paths[f.prefix]), found, f"stamps like those of {first}")
     dates = stamps[first].dtype.kind in "Mm"
     clocks = {}
+    own = {
+        f.prefix: {k: x for k, x in data.items() if k.startswith(f"{f.prefix}:") and k != f"{f.prefix}:{f.time}"}
+        for f in m.files
+    }
     for f in m.files:
         x, origin = stamps[f.prefix], stamps[first][0]
         # Numbers may be of several units, and count from one origin.
         s = stamp_seconds(x, 1.0, origin) if dates else x * f.time_factor - origin * m.files[0].time_factor
-        clocks[f.prefix] = check_stamps(s + f.shift, m.sample_rate, paths[f.prefix])
+        rows = list(own[f.prefix].values())
+        clocks[f.prefix] = clock = check_stamps(s + f.shift, m.sample_rate, paths[f.prefix], rows)
+        if clock.rounded:
+            say(f"{paths[f.prefix].name}: {clock.told()}")
     last = max(clocks, key=lambda k: clocks[k].t[0])
     soonest = min(clocks, key=lambda k: clocks[k].t[-1])
     start, end = float(clocks[last].t[0]), float(clocks[soonest].t[-1])
@@ -50,9 +57,8 @@ def on_one_clock(
     t = uniform_times(start, end, m.sample_rate)
     out = dict(data)
     for f in m.files:
-        prefix, clock = f"{f.prefix}:", clocks[f.prefix]
-        own = {k: x for k, x in data.items() if k.startswith(prefix) and k != f"{prefix}{f.time}"}
-        signals = {k: _by_time(x, len(clock.t), k, paths[f.prefix]) for k, x in own.items()}
+        clock = clocks[f.prefix]
+        signals = {k: _by_time(x, len(clock.t), k, paths[f.prefix]) for k, x in own[f.prefix].items()}
         for c in m.columns:
             if c.turn is None or c.source not in signals:
                 continue
