@@ -98,5 +98,6 @@ def over_noise(group: Group, Z: np.ndarray) -> tuple[np.ndarray, np.ndarray, flo
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * REACH + 1, axis=0)
     near = np.delete(around, np.arange(REACH - NEXT, REACH + NEXT + 1), axis=-1)
     ratio = np.ones_like(white)
-    ratio[1:] = white[1:] * middle / np.maximum(np.nanmedian(near, axis=-1), QUIETEST)
+    told = np.any(np.isfinite(near), axis=-1)  # of a few lines the middle ones have none near by
+    ratio[1:][told] = white[1:][told] * middle / np.maximum(np.nanmedian(near[told], axis=-1), QUIETEST)
     return ratio, lines, own

@@ -402,6 +402,34 @@ def test_a_repeated_motion_is_said(tmp_path, pair):
     assert "# period = 400" in guessed.text
 
 
+def test_a_motion_that_repeats_at_one_joint_only_is_none_that_repeats(tmp_path, pair):
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) / 500.0
+    slow = 0.5 * np.cumsum(rng.normal(size=3000)) / 500 + np.sin(1.3 * t)
+    for q in (np.stack([np.sin(2 * np.pi * t), slow], axis=1), np.stack([slow, np.sin(2 * np.pi * t)], axis=1)):
+        tau = q * [[30.0, 1.0]] + 0.1 * rng.normal(size=q.shape)
+        np.savez(tmp_path / "log.npz", time=t, q=q, tau=tau)
+        assert "[multisine]" not in guess_map([tmp_path / "log.npz"], pair.folder).text
+    # A joint that stands, and shows noise alone, does not hinder.
+    still = np.stack([np.sin(2 * np.pi * t), 1e-5 * rng.normal(size=3000)], axis=1)
+    np.savez(tmp_path / "log.npz", time=t, q=still, tau=30 * still + 0.1 * rng.normal(size=q.shape))
+    assert "# period = 500" in guess_map([tmp_path / "log.npz"], pair.folder).text
+
+
+def test_a_proposed_multisine_of_several_files_can_be_used_as_written(tmp_path, pair):
+    _, q, _, tau = motion(N=400)
+    logs = [tmp_path / f"run_{k}.npz" for k in range(3)]
+    for log in logs:
+        np.savez(log, time=np.arange(2000) / 500.0, q=np.tile(q, (5, 1)), tau=np.tile(tau, (5, 1)))
+    text = guess_map(logs, pair.folder).text
+    head, proposed = text.split("# [multisine]")
+    (tmp_path / "map.toml").write_text(head + "[multisine]" + re.sub("(?m)^# ", "", proposed))
+    data = convert_logs(logs, pair.folder, tmp_path / "map.toml")
+    assert [(s.name, s.kind, s.role) for s in data.segments] == [
+        ("run_0-1", "multisine", "identification"), ("run_1-1", "multisine", "identification"), ("run_2-1", "multisine", "validation"),
+    ]  # fmt: skip
+
+
 # --- ROS 2 recordings and MATLAB 7.3
 
 

@@ -53,7 +53,11 @@ def mapped(folder, text):
         ('"x" }', '"x" }\n' + PARTS.replace("period", "perod"), r"multisine\.perod.*an unknown key"),
         ('"x" }', '"x" }\n' + PARTS + 'rol = "validation"', r"multisine\.part\.rol.*an unknown key.*'role'"),
         ('"x" }', '"x" }\n[multisine]', "multisine"),
-        ('"x" }', '"x" }\n' + PARTS + '[roles]\nlog = "validation"', r"\[roles\].*\[multisine\] as well"),
+        (
+            '"x" }',
+            '"x" }\n' + PARTS + 'role = "validation"\n[roles]\nlog = "validation"',
+            r"\[roles\].*role in \[\[multisine\.part\]\] as well",
+        ),
         ('"x" }', '"x", plus = [{ source = "u", factor = 1.0, unit = "deg" }] }', r"q_1\.plus\.unit.*an unknown key"),
         ('"x" }', '"x", unit = "N m" }', r"unit of q_1.*'N m'.*'rad'"),
         ('"x" }', '"x", unit = "mm" }', r"unit of q_1.*'mm'.*'rad'"),

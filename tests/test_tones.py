@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from ident.hypotheses import catalogue
 from ident.identification import identify
 from ident.model import Effect
 from ident.problem import predictions
-from ident.tones import Tone, find_tones, swinging
+from ident.tones import Tone, find_tones, over_noise, swinging
 from robot_assets.robot import load_robot
 from tests.conftest import quick_experiment, small_plan, through_files
 
@@ -57,6 +58,17 @@ def test_a_resonance_of_the_links_is_where_they_swing(damping, told):
     Z[0] = 0.0  # as without gravity
     there = swinging(Z[:, None, None])
     assert there.shape == (len(Z), 1) and set(np.flatnonzero(there)) == ({19, 20, 21} if told else set())
+
+
+def test_lines_with_none_near_by_show_no_tone(monkeypatch):
+    """Of six lines the middle one has none but those next to it."""
+    d = np.random.default_rng(0).normal(size=(2, 6, 2)) + 0j
+    monkeypatch.setattr("ident.tones.noise_alone", lambda group, Z: (d, np.arange(6), 1.0))
+    group = SimpleNamespace(U=np.ones((2, 6, 2)), U_periods=np.ones((2, 3, 6, 2)))
+    with catch_warnings():
+        simplefilter("error")
+        ratio, _, _ = over_noise(group, np.tile(np.eye(2), (6, 1, 1)))
+    assert np.all(np.isfinite(ratio)) and np.all(ratio[3] == 1.0)
 
 
 @pytest.mark.slow

@@ -112,6 +112,11 @@ def _called(name: str, path: Path) -> tuple[str, ...]:
     return name, path.stem, path.name
 
 
+def _role(name: str, path: Path, m: LogMap) -> str | None:
+    """What [roles] says of a log; None where it says nothing."""
+    return next((m.roles[k] for k in _called(name, path) if k in m.roles), None)
+
+
 def _check_roles(logs: list[tuple[str, dict[str, Path]]], m: LogMap, where: str) -> None:
     """Raise a DataError where a role is that of no log: what was to be held out would be fitted to."""
     names = {called for name, paths in logs for called in _called(name, next(iter(paths.values())))}
@@ -238,7 +243,7 @@ def _cut(
             Segment(
                 name=f"{name}-{i + 1}",
                 kind="multisine",
-                role=part.role,
+                role=part.role or _role(name, path, m) or "identification",
                 t=t[pick],
                 operating_point=m.operating_point,
                 period=m.period,
@@ -253,7 +258,7 @@ def _cut(
 
 
 def _motions(name: str, path: Path, m: LogMap, t: np.ndarray, channels: dict[str, Any]) -> list[Segment]:
-    role = next((m.roles[k] for k in _called(name, path) if k in m.roles), None)
+    role = _role(name, path, m)
     if m.split is None or role is not None:
         return [Segment(name=name, kind="trajectory", role=role or "identification", t=t, **channels)]
     cut = int(m.split * len(t))

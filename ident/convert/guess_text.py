@@ -33,6 +33,8 @@ MISSED = {"tau": ("motor torque or current", ("N m", "N")), "q": ("motor positio
 
 LONGEST_NOTE = 1000  # characters
 MOST_UNUSED = 60  # signals that are listed
+LONGEST_PERIODIC = 2**19  # samples in which a period is looked for
+UNLIKE = 0.3  # of a signal, by which two periods of it may differ beside its noise
 
 
 @dataclass(frozen=True)
@@ -158,17 +160,19 @@ def _multisine(guess: Guess) -> Iterator[str]:
     if period is None:
         return
     last = max(2, len(guess.chosen["tau"].x) // period)
+    several = len(guess.paths) > 1 and not guess.parts
     yield from (
         "",
-        f"# The torque repeats every {period} samples: for a multisine around one posture take the # away (and `split`).",
+        f"# The motion repeats every {period} samples: for a multisine around one posture take the # away"
+        + (", of all files." if several else " (and `split`)."),
         "# [multisine]",
         f"# period = {period}",
         '# operating_point = "op01"',
         "# excited_lines = [1, 3, 5]   # EDIT, or excited_from = a signal",
         "# [[multisine.part]]",
         "# first = 2                # the first period has the transient",
-        f"# last = {last}",
-        '# role = "identification"',
+        f"# last = {last}" + ("                # the role is that of each file in [roles]" if several else ""),
+        *([] if several else ['# role = "identification"']),
     )
 
 
@@ -189,11 +193,11 @@ def _rate_note(time: FoundTime, joined: bool) -> str:
 
 
 def period_of(chosen: Mapping[str, Family]) -> int | None:
-    """Samples after which the torque repeats, at least three times; None where it does not."""
+    """Samples after which torque and position of all joints repeat, at least three times; None where they do not."""
     if "tau" not in chosen:
         return None
     x = chosen["tau"].x
-    x = x[: 2**19, int(np.argmax(np.std(x, axis=0)))]
+    x = x[:LONGEST_PERIODIC, int(np.argmax(np.std(x, axis=0)))]
     x = x - x.mean()
     N = len(x)
     r = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * N)) ** 2)[:N]
@@ -212,7 +216,29 @@ def period_of(chosen: Mapping[str, Family]) -> int | None:
     start = int(np.flatnonzero(c > 0.97 * c.max())[0])
     below = np.flatnonzero(c[start:] < 0.9 * c.max())
     end = start + (int(below[0]) if len(below) else len(c) - start)
-    return int(lags[start + int(np.argmax(c[start:end]))])
+    period = int(lags[start + int(np.argmax(c[start:end]))])
+    columns = [column for k in ("tau", "q") if k in chosen for column in chosen[k].x[:LONGEST_PERIODIC].T]
+    moving = [x for x in columns if np.ptp(x[period:]) > 0]
+    if not moving:
+        return None
+    # The top of a smooth hill is blurred by noise, of which one column has the least.
+    clear = min(moving, key=_noise_share)
+    near = 0
+    while near != period:
+        near, period = period, min(range(max(16, period - 2), min(period + 3, N // 3)), key=lambda p: _change(clear, p))
+    return period if all(_change(x, period) <= UNLIKE**2 for x in moving) else None
+
+
+def _noise_share(x: np.ndarray) -> float:
+    """Variance of white noise in a signal (N,), of which third differences have 20 times, over that of the signal."""
+    return float(np.mean(np.diff(x, 3) ** 2) / 20 / np.var(x))
+
+
+def _change(x: np.ndarray, period: int) -> float:
+    """What a signal (N,) differs by from the period before, its noise apart, over its variance; after the first period,
+    which has the transient."""
+    x = x[period:]
+    return float(np.mean((x[period:] - x[:-period]) ** 2) / np.var(x)) - 2 * _noise_share(x)
 
 
 def plain(text: str, most: int = 120) -> str:

@@ -60,11 +60,11 @@ class Column:
 
 @dataclass(frozen=True)
 class Part:
-    """Periods ``first..last`` (from 1) of a periodic log as one segment."""
+    """Periods ``first..last`` (from 1) of a periodic log as one segment; without a role it has that of its file."""
 
     first: int
     last: int
-    role: str
+    role: str | None
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,8 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
         raise DataError("[[multisine.part]]", where, "none", "the periods of at least one segment")
     by_first = sorted(parts, key=lambda p: p.first)
     for a, b in itertools.pairwise(by_first):
-        if b.first <= a.last and a.role != b.role:
-            found = f"period {b.first} for {a.role} and for {b.role}"
+        if b.first <= a.last and (a.role or ROLES[0]) != (b.role or ROLES[0]):
+            found = f"period {b.first} for {a.role or ROLES[0]} and for {b.role or ROLES[0]}"
             raise DataError("[[multisine.part]]", where, found, "held-out periods that nothing is fitted to")
     lines = multisine.get("excited_lines", [])
     if not isinstance(lines, list) or not all(
@@ -179,10 +179,8 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
     if period is not None and lines and max(lines) >= period / 2:
         raise DataError("multisine.excited_lines", where, f"line {max(lines)}", f"lines below Nyquist, {period / 2:g}")
     roles = subtable(data, "roles", where)
-    if roles and period is not None:
-        raise DataError(
-            "[roles]", where, "[multisine] as well", "role in [[multisine.part]]: it is that of each segment"
-        )
+    if roles and any(part.role is not None for part in parts):
+        raise DataError("[roles]", where, "role in [[multisine.part]] as well", "one of both")
     files = tuple(_file(k, v, where) for k, v in subtable(data, "files", where).items())
     source = text(time, "source", f"{where} time") if "time" in data else None
     factor = unit_factor(time.get("unit", "s"), TIMES, "time", where)
@@ -232,7 +230,7 @@ def _part(entry: dict, where: str) -> Part:
     _known(entry, PART_KEYS, "multisine.part.", where)
     first = whole(entry, "first", where, low=1)
     last = whole(entry, "last", where, low=first)
-    return Part(first, last, choice(entry, "role", where, ROLES, "identification"))
+    return Part(first, last, choice(entry, "role", where, ROLES) if "role" in entry else None)
 
 
 def _file(prefix: str, entry: Any, where: str) -> FilePart:
