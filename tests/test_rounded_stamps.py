@@ -69,6 +69,8 @@ def rows_of(kind):
     slow = np.arange(N // 2) / 100.0
     if kind == "lost samples":
         t = t[np.sort(rng.permutation(N)[30:])]
+    elif "gap" in kind:
+        t = np.r_[t[:1500], t[1500:] + {"a gap": 0.3, "a short gap": 0.0005}[kind]]
     elif kind == "one of five not logged":
         t = t[np.arange(N) % 5 < 4]
     elif kind == "jitter":
@@ -89,7 +91,7 @@ def rows_of(kind):
 
 
 @pytest.mark.parametrize(
-    "kind", ["lost samples", "one of five not logged", "jitter", "events", "bursts", "rows twice", "some rows twice", "topics that take turns"]
+    "kind", ["a gap", "a short gap", "lost samples", "one of five not logged", "jitter", "events", "bursts", "rows twice", "some rows twice", "topics that take turns"]
 )  # fmt: skip
 @pytest.mark.parametrize("digits", [3, 6])
 def test_other_rows_stay_where_their_stamps_are(kind, digits):

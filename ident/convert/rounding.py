@@ -11,7 +11,7 @@ import numpy as np
 LEAST = 0.05  # of a sample, below which rounding is none to care about
 SAME = 0.1  # of the rounding step, in which steps of one size differ: fractions of a tick are rounded themselves
 GAPS = 0.01  # of the rows, after which some are lost, at most: where more are the clock is not even
-RARER = 0.01  # of the steps have the rarer size, at least, where it may as well be that of a sample that was lost
+RARER = 0.01  # of the steps have the rarer size, at least, where it may as well be a row that was lost or repeated
 DIFFER = 0.5  # of the rows that share a stamp with the one before, at least; else rows are repeated
 SMOOTHER = 1.1  # times the roughness at the stamps, above which signals tell that these are right
 LOOKED_AT = 200_000  # rows in which signals are looked at
@@ -56,8 +56,8 @@ def even_rows(t: np.ndarray, signals: Sequence[np.ndarray], step: float | None =
     times = low / by
     if np.any(between & ~gap) or np.mean(gap) > GAPS or abs(times - round(times)) > SAME:
         return None
-    # A step of two samples may be a rounded one, or a sample that was lost.
-    if round(times) == 1 and min(len(above), len(sizes) - len(above)) < RARER * len(sizes):
+    # A few stamps twice, or steps of another size, are rows repeated or lost rather than a rounded clock.
+    if (min(len(above), len(sizes) - len(above)) if round(times) else np.sum(sizes == 0)) < RARER * len(sizes):
         return None
     starts = np.concatenate([[0], np.flatnonzero(gap) + 1])
     grid = _grid(t, starts, by, None)
