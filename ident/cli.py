@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import secrets
 import sys
@@ -17,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from robot_assets.errors import DataError
+from robot_assets.values import exists
 
 if TYPE_CHECKING:
     from ident.verdict import Diagnosis
@@ -39,6 +41,8 @@ def main() -> None:
     except (typer.Abort, KeyboardInterrupt):
         sys.exit(_fail("interrupted"))
     except Exception as err:
+        if isinstance(err, OSError) and err.errno == errno.ENAMETOOLONG:  # of whatever path the command was given
+            sys.exit(_fail(f"path: {err.filename}: found a name that is too long, expected one that a file can have"))
         if type(err).__name__ == "NoArgsIsHelpError":
             sys.exit(_fail("no command: one of those above is expected"))
         if type(err).__module__.startswith(("click", "typer")):
@@ -417,7 +421,7 @@ LARGE_LOG = 50e6  # bytes, below which a log is read before progress could be re
 
 
 def _soon_read(files: list[Path]) -> bool:
-    return sum(f.stat().st_size for f in files if f.is_file()) < LARGE_LOG
+    return sum(f.stat().st_size for f in files if exists(f)) < LARGE_LOG
 
 
 def _guess(files: list[Path], robot: str, out: Path, json_: bool, quiet: bool) -> None:

@@ -272,7 +272,7 @@ def _filled(entry: dict, where: str) -> Filled | None:
 def _inside(folder: Path, file: str, where: str) -> Path:
     """The path of a segment's file, which must not leave the dataset folder."""
     pure = Path(file)
-    if pure.is_absolute() or ".." in pure.parts or "\x00" in file or "\\" in file:
+    if not pure.name or pure.is_absolute() or ".." in pure.parts or "\x00" in file or "\\" in file:
         raise DataError("file", where, show(file), "a file inside the dataset folder")
     path = folder / pure
     try:

@@ -38,6 +38,14 @@ def exists(path: Path) -> bool:
         return False
 
 
+def instead_of_file(path: Path) -> str:
+    """What stands where a file should, in words."""
+    try:
+        return "a folder" if path.is_dir() else "no file" if path.exists() else "no such file"
+    except (OSError, ValueError):
+        return "no such file"
+
+
 def show(value: Any) -> str:
     """A value as an error quotes it."""
     if value is MISSING or value is None:

@@ -278,6 +278,12 @@ def test_an_empty_cell_is_named_with_its_place(folder):
     assert "tau_2" in line and "sample 9" in line
 
 
+@pytest.mark.parametrize("file", [".", "./", "a.parquet/.."])
+def test_a_segment_that_is_the_folder_itself_is_refused(folder, file):
+    rewrite(folder / "dataset.toml", lambda head: set_odd(head["segment"][1], "file", file))
+    assert "a file inside the dataset folder" in outcome(load_dataset, folder)
+
+
 @pytest.mark.parametrize("second", ["./a.parquet", "c/../a.parquet", "a.csv", "A/../a.parquet"])
 def test_the_same_segment_by_another_spelling_is_refused(folder, second):
     table = pq.read_table(folder / "a.parquet")

@@ -12,7 +12,7 @@ import numpy as np
 
 from ident.convert.quantities import KINDS, is_position, unit_factor, units_of
 from robot_assets.errors import DataError
-from robot_assets.values import choice, exists, number, read_toml, show, subtable, tables, text, whole
+from robot_assets.values import choice, exists, instead_of_file, number, read_toml, show, subtable, tables, text, whole
 
 SMALLEST = 1e-15  # a factor that leaves nothing of any signal
 COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
@@ -140,7 +140,10 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
         file = SHIPPED / f"{path}.toml"
     if not exists(file):
         raise DataError(
-            "map", str(path), "no such file", f"a map, or one of {sorted(p.stem for p in SHIPPED.glob('*.toml'))}"
+            "map",
+            str(path),
+            instead_of_file(Path(path)),
+            f"a map, or one of {sorted(p.stem for p in SHIPPED.glob('*.toml'))}",
         )
     where = str(file)
     data = read_toml(file, "map")

@@ -19,6 +19,7 @@ from ident.convert.layout import read_layout
 from ident.convert.texts import MOST_CELLS, alike, distinct, read_text, scan_text, text_names, text_units
 from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
+from robot_assets.values import exists, instead_of_file
 
 DEEPEST = 8  # structures inside structures that are looked into
 MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
@@ -168,8 +169,8 @@ def _instead(x: np.ndarray | None) -> str:
 
 def _read(path: Path, wanted: set[str] | None, by: Reader | None = None) -> dict[str, Any]:
     """Signals of a file; None wants them all. ``by``: another reader than that of its suffix."""
-    if not path.is_file():
-        raise DataError("log", str(path), "no such file", f"a file of {FORMATS}")
+    if not exists(path):
+        raise DataError("log", str(path), instead_of_file(path), f"a file of {FORMATS}")
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise DataError("log", str(path), path.suffix or "no suffix", f"one of {FORMATS}")
