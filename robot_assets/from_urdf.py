@@ -20,7 +20,7 @@ from robot_assets.guesses import GRAVITY, JointGuess, guess_joints, link_at, uni
 from robot_assets.plausible import doubts
 from robot_assets.robot import Robot, load_robot
 from robot_assets.urdf import Description, read_urdf
-from robot_assets.values import exists
+from robot_assets.values import exists, instead_of_file
 
 MOST = 100  # driven joints
 
@@ -40,14 +40,14 @@ def draft_robot(urdf: str | Path, lock: Mapping[str, float | None] | None = None
 
     Args:
         lock: joints that do not move, and where they stand (rad or m; None: zero, or the limit
-            nearest to it). Joints that mimic another one are locked by themselves.
+            nearest to it). Joints that mimic another one are locked by themselves, where it holds them.
 
     Raises:
         DataError: where the URDF cannot be read, has no free joint, or a locked joint is none of its own.
     """
     path = Path(urdf)
     if not exists(path):
-        raise DataError("URDF", str(urdf), "no such file", "a URDF")
+        raise DataError("URDF", str(urdf), instead_of_file(path), "a URDF")
     tree = read_urdf(path)
     root = ET.fromstring(path.read_bytes())
     elements = {e.get("name", ""): e for e in root.findall("joint")}
@@ -57,7 +57,8 @@ def draft_robot(urdf: str | Path, lock: Mapping[str, float | None] | None = None
         raise DataError("joints", str(path), "no movable joint that is free", "at least one to drive")
     if len(names) > MOST:
         raise DataError("joints", str(path), f"{len(names)} that are free", f"at most {MOST}: lock the others")
-    guesses, warnings = guess_joints(path, tree, names, locked), list(doubts(root))
+    guesses = guess_joints(path, tree, names, locked)
+    warnings = _followers(tree, elements, lock or {}, locked) + list(doubts(root))
     for guess in guesses:
         if guess.inertia[1] <= 0:
             warnings.append(
@@ -152,10 +153,37 @@ def _locked(path: Path, tree: Description, elements: dict[str, ET.Element], lock
             raise DataError(
                 "--lock", str(path), f"{name}={lock[name]:g}", f"a position within its limits, {low:g} to {high:g}"
             )
-    for name in tree.limits:
-        if elements[name].find("mimic") is not None:
-            lock.setdefault(name, None)
-    return {k: float(np.clip(0.0, *tree.limits[k])) if v is None else float(v) for k, v in lock.items()}
+    mimics = {k: m for k in tree.limits if k not in lock and (m := elements[k].find("mimic")) is not None}
+
+    def position(name: str) -> float:
+        """Where a joint stands, beside those that are driven at zero."""
+        value = lock.get(name)
+        if name in mimics:
+            leader = position(mimics[name].get("joint", ""))
+            value = float(mimics[name].get("multiplier", "1")) * leader + float(mimics[name].get("offset", "0"))
+        elif value is None and name not in lock:
+            return 0.0
+        return float(np.clip(value or 0.0, *tree.limits[name]))
+
+    return {name: position(name) for name in (*lock, *mimics)}
+
+
+def _followers(
+    tree: Description, elements: dict[str, ET.Element], by_hand: Mapping[str, float | None], locked: Mapping[str, float]
+) -> list[str]:
+    """Of joints that mimic one that is driven, and cannot do so here, in words."""
+    out = []
+    for name in locked:
+        leader = name
+        while leader not in by_hand and leader in elements and (m := elements[leader].find("mimic")) is not None:
+            leader = m.get("joint", "")
+        if leader != name and leader in tree.limits and leader not in by_hand:
+            unit = "m" if tree.kinds[name] == "prismatic" else "rad"
+            out.append(
+                f"{name} mimics {leader}, but a robot.toml has no joint that follows another: {name} is locked at "
+                f"{locked[name]:.3g} {unit}, and what it carries does not move with {leader}"
+            )
+    return out
 
 
 def _depth(elements: dict[str, ET.Element], link: str) -> int:

@@ -13,6 +13,7 @@ import pytest
 
 from ident.cli import main
 from ident.dataset_io import load_dataset
+from robot_assets.robot import load_robot
 from tests.hostile import datasets, logs, maps, robots
 from tests.hostile.case import ACCEPTED, REFUSED, Case
 
@@ -95,6 +96,35 @@ def check_case(case: Case, folder: Path, capfd, monkeypatch) -> None:
     # What the parser of the command line refuses it says in its own words.
     assert ("found" in line and "expected" in line) or "Invalid value" in line or case.id.startswith("options"), line
     assert not left, left
+
+
+LONG = "n" * 300
+
+
+@pytest.mark.parametrize(
+    ("args", "found"),
+    [
+        (("convert", "log.csv", "--robot", "twomass", "--guess", "--map", f"{LONG}.toml"), "too long"),
+        (("convert", f"{LONG}.csv", "--robot", "twomass", "--guess", "--map", "map.toml"), "no such file"),
+        (("convert", "log.csv", "--robot", "twomass", "--map", "map.toml", "--out", LONG), "too long"),
+        (("robot", "arm.urdf", "--out", LONG), "too long"),
+        (("experiment", "twomass", "--out", LONG), "too long"),
+        (("design", "twomass", "--out", LONG), "too long"),
+        (("demo", "--out", LONG), "too long"),
+        (("convert", "there", "--robot", "twomass", "--guess", "--map", "map.toml"), "found a folder"),
+        (("convert", "log.csv", "--robot", "twomass", "--map", "there", "--out", "out"), "found a folder"),
+        (("robot", "there", "--out", "out"), "found a folder"),
+    ],
+)
+def test_a_name_that_no_file_can_have_and_a_folder_in_place_of_a_file(args, found, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "log.csv").write_text("t,q,tau\n0,1,2\n1,2,3\n")
+    (tmp_path / "arm.urdf").write_bytes(load_robot("twomass").urdf.read_bytes())
+    before = snapshot(tmp_path)
+    status, err = run_here(list(args), capfd, monkeypatch)
+    assert status == 2 and found in err and "expected" in err and len(err.splitlines()) == 1, err
+    assert snapshot(tmp_path) == before
 
 
 def marked() -> list:

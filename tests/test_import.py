@@ -88,7 +88,7 @@ def test_the_command_writes_a_robot_that_loads_and_simulates(tmp_path):
     run = simgap("robot", urdf, "--out", tmp_path / "arm", "--lock", "panda_finger_joint1=0.02")
     assert run.returncode == 0 and "GUESS" in run.stdout, run.stderr
     robot = load_robot(tmp_path / "arm")
-    assert robot.n == 7 and robot.locked == {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.0}
+    assert robot.n == 7 and robot.locked == {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02}
     assert robot.array("torque_limit").tolist() == [87.0] * 4 + [12.0] * 3
     written = (tmp_path / "arm" / "robot.toml").read_text()
     assert tomllib.loads(written)["name"] == "arm"

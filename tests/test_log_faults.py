@@ -19,6 +19,7 @@ from ident.gain import Errors, measure_gain
 from ident.identification import set_up
 from ident.torque_checks import mislabelled
 from robot_assets.errors import DataError
+from robot_assets.from_urdf import write_robot
 from robot_assets.robot import load_robot
 from robot_assets.urdf import read_urdf
 from tests.test_cli import simgap as run
@@ -215,6 +216,28 @@ def test_joints_that_mimic_each_other_are_refused(tmp_path):
             read_urdf(tmp_path / "r.urdf")
     (tmp_path / "r.urdf").write_text((text + second.format("one")).replace('<mimic joint="two"/>', ""))
     read_urdf(tmp_path / "r.urdf")
+
+
+def test_a_joint_that_mimics_a_driven_one_is_locked_and_told(tmp_path):
+    text = BODY.format(mass=1, i=(1, 1, 1, 0), mimic="").replace("</robot>", "")
+    second = """<link name="c"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+    <joint name="two" type="revolute"><parent link="b"/><child link="c"/><mimic joint="one" multiplier="2" offset="0.1"/>
+    <limit lower="-3" upper="3" effort="8" velocity="3"/></joint>"""
+    third = second.replace('name="c"', 'name="d"').replace('link="c"', 'link="d"').replace('"two"', '"three"')
+    (tmp_path / "r.urdf").write_text(text + second + third + "</robot>")
+    robot, warnings = write_robot(tmp_path / "r.urdf", tmp_path / "arm")
+    assert robot.joint_names == ("one",) and robot.locked == {"two": 0.1, "three": 0.1}
+    told = [w for w in warnings if "mimics one" in w]
+    assert [w.split()[0] for w in told] == ["two", "three"] and "locked at 0.1 rad" in told[0]
+    assert f"# CHECK: {told[0]}" in (tmp_path / "arm" / "robot.toml").read_text()
+    # Where nothing moves that it would follow, and where it was locked by hand, nothing is wrong.
+    (tmp_path / "r.urdf").write_text(
+        text + second + third.replace('<mimic joint="one" multiplier="2" offset="0.1"/>', "") + "</robot>"
+    )
+    robot, warnings = write_robot(tmp_path / "r.urdf", tmp_path / "other", {"one": 0.5})
+    assert robot.locked == {"one": 0.5, "two": 1.1} and not [w for w in warnings if "mimics" in w]
+    robot, warnings = write_robot(tmp_path / "r.urdf", tmp_path / "third", {"two": 0.7})
+    assert robot.locked == {"two": 0.7} and not [w for w in warnings if "mimics" in w]
 
 
 def test_truth_values_are_no_positions(tmp_path):
