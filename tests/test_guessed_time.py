@@ -120,6 +120,24 @@ def test_a_month_that_may_be_a_day_is_said(tmp_path):
         ] == RATE
 
 
+@pytest.mark.parametrize("way", ["%d/%m/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S.%f", "%m-%d-%Y %H:%M:%S.%f"])
+@pytest.mark.parametrize("piece", [1000, 1 << 20])
+@pytest.mark.parametrize("day", [2, 12])
+def test_midnight_tells_which_number_is_the_day(tmp_path, monkeypatch, way, piece, day):
+    monkeypatch.setattr("ident.convert.texts.PIECE", piece)
+    start = datetime(2026, 11, day, 23, 59, 58)
+    log, found, read = guessed(tmp_path, {"Date": [(start + timedelta(seconds=x)).strftime(way) for x in T]})
+    assert read["sample_rate"] == RATE and "EDIT" not in found.found["time"] and not found.warnings
+    segments = convert_logs([log], "twomass", tmp_path / "guessed.toml").segments
+    assert np.allclose(np.concatenate([s.q for s in segments])[:, 0], 0.5 * np.sin(4 * T), atol=1e-9)
+
+
+def test_a_long_pause_is_no_wrong_unit_of_time(tmp_path):
+    log, _, _ = guessed(tmp_path, {"t": T + 36000.0 * (np.arange(N) >= 700)})
+    with pytest.raises(DataError, match=r"3\.6e\+04 s without a sample after 1\.398 s.*cut the log into two"):
+        convert_logs([log], "twomass", tmp_path / "guessed.toml")
+
+
 @pytest.mark.parametrize(
     ("rate", "unit", "marked"), [(10.0, "s", True), (4.0, "s", True), (1000.0, "ms", True), (250.0, "s", False)]
 )

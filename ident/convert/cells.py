@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from ident.convert.dates import DATE, date_order, is_date, parse_dates
+from ident.convert.dates import DATE, date_order, day_and_month_swapped, is_date, parse_dates
 from robot_assets.errors import DataError
 
 NUMBER = r"(?i)^\s*([+-]?(\d+\.?\d*|\.\d+)([ed][+-]?\d+)?|[+-]?inf(inity)?|[+-]?nan|)\s*$"
@@ -51,6 +51,7 @@ class Cells:
         self.labels: tuple[str, ...] = ()
         self._parts: list[np.ndarray] = []
         self._grouped: tuple[int, str] | None = None  # (row, text) of the first with a sign between its thousands
+        self._above = ""  # the last date, as long as the order of day and month is a guess
         self._shown = self._pointed = False  # whether a cell shows that these are thousands; that they are none
 
     def take(self, column: pa.Array) -> None:
@@ -95,10 +96,12 @@ class Cells:
         return np.concatenate(parts)
 
     def _dates(self, column: pa.Array) -> np.ndarray:
-        order = date_order(column) if self.order[1] else self.order
-        if not order[1] and order[0] != self.order[0] and DATE.match(self.like):
-            raise ValueError("another order of day and month than above")
+        order = date_order(column, self._above) if self.order[1] else self.order
+        if order[0] != self.order[0]:  # above it was a guess
+            self._parts = [day_and_month_swapped(p) if p.dtype.kind == "M" else p for p in self._parts]
         self.order = order
+        if order[1] and column.null_count < len(column):
+            self._above = _text(column.drop_null()[-1])
         return parse_dates(column, self.like, self.order)
 
     def _numbers(self, column: pa.Array) -> np.ndarray:

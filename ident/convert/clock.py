@@ -102,13 +102,15 @@ def check_stamps(t: np.ndarray, rate: float, path: Path, signals: Sequence[np.nd
     t = t if even is None else even.t
     step = np.diff(t)
     span = t[-1] - t[0]
-    if span * rate > LONGEST * len(t) or span * rate < len(t) / LONGEST:
-        found = f"{len(t)} samples over {span:.4g} s"
-        raise DataError("time", str(path), found, f"about sample_rate = {rate:g} Hz: is the unit of time right?")
-    if step.size and step.max() > max(LONGEST_GAP, 2.0 / rate):
+    usual = even.step if even is not None else float(np.median(step[step > 0])) if np.any(step > 0) else 1 / rate
+    spans = len(t) / LONGEST <= span * rate <= LONGEST * len(t)
+    # One that is ages long, beside steps that are right, is no wrong unit.
+    if step.size and step.max() > max(LONGEST_GAP, 2.0 / rate) and (spans or 1 / LONGEST < usual * rate < LONGEST):
         found = f"{step.max():.4g} s without a sample after {t[int(np.argmax(step))] - t[0]:.4g} s"
         raise DataError("time", str(path), found, f"gaps of at most {LONGEST_GAP:g} s: cut the log into two there")
-    usual = even.step if even is not None else float(np.median(step[step > 0])) if np.any(step > 0) else 1 / rate
+    if not spans:
+        found = f"{len(t)} samples over {span:.4g} s"
+        raise DataError("time", str(path), found, f"about sample_rate = {rate:g} Hz: is the unit of time right?")
     long = step > GAP * max(usual, 1 / rate)
     return Stamps(t, 1 / usual, t[:-1][long], t[1:][long], 0.0 if even is None else even.by)
 

@@ -59,20 +59,40 @@ def dates_of_texts(texts: Any) -> np.ndarray:
     return column.to_numpy(zero_copy_only=False)
 
 
-def date_order(column: pa.Array) -> tuple[str, bool]:
+def date_order(column: pa.Array, before: str = "") -> tuple[str, bool]:
     """The order of year, month and day in texts of dates, and whether it is a guess: "3/4/2026" may be of April or of
-    March."""
+    March, as long as no number is above 12 and no midnight tells which of them is the day.
+
+    Args:
+        before: the date above them.
+    """
     first = next((x.as_py() for x in column if x.is_valid and x.as_py()), "").strip()
     found = DATE.match(first)
     if found is None or len(found["a"]) == 4:
         return "ymd", False
     if found["sign"] == ".":
         return "dmy", False
+    above = [DATE.match(before.strip()) or found]
     numbers = pc.extract_regex(column, r"^\s*(?P<a>\d\d?)[-/](?P<b>\d\d?)[-/]").drop_null()
-    a, b = (pc.max(pc.cast(pc.struct_field(numbers, k), pa.int32())).as_py() or 0 for k in ("a", "b"))
-    if max(a, b) > 12:
-        return ("dmy" if a > 12 else "mdy"), False
+    a, b = (
+        np.append([int(m[k]) for m in above], pc.cast(pc.struct_field(numbers, k), pa.int32()).to_numpy(False))
+        for k in ("a", "b")
+    )
+    if max(a.max(), b.max()) > 12:
+        return ("dmy" if a.max() > 12 else "mdy"), False
+    first_moves, second_moves = np.diff(a) != 0, np.diff(b) != 0
+    days_first, days_second = np.any(first_moves & ~second_moves), np.any(second_moves & ~first_moves)
+    if days_first != days_second:
+        return ("dmy" if days_first else "mdy"), False
     return ("dmy" if found["sign"] == "-" else "mdy"), True
+
+
+def day_and_month_swapped(dates: np.ndarray) -> np.ndarray:
+    """(N,) datetime64 of dates whose month was taken for the day; both are 12 at most."""
+    month, day = dates.astype("datetime64[M]"), dates.astype("datetime64[D]")
+    year = dates.astype("datetime64[Y]")
+    swapped = year.astype("datetime64[M]") + (day - month.astype("datetime64[D]")).astype(int)
+    return (swapped.astype("datetime64[D]") + (month - year.astype("datetime64[M]")).astype(int)) + (dates - day)
 
 
 def parse_dates(column: pa.Array, like: str, order: tuple[str, bool]) -> np.ndarray:
