@@ -70,6 +70,16 @@ def test_a_time_that_cannot_be_used_is_told_and_marked(tmp_path, kind, why, erro
     assert error in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("t", "why"),
+    [(T[::-1], "falls"), (np.full(N, 5.0), "is the same in all rows"), (np.sin(40 * T), "goes back in row")],
+)
+def test_a_column_of_times_that_never_rises_is_told(tmp_path, t, why):
+    _, found, read = guessed(tmp_path, {"timestamp": t})
+    assert len(found.warnings) == 1 and found.warnings[0].startswith(f"no time: timestamp {why}")
+    assert "time" not in read and f"# EDIT: timestamp is not used as the time: it {why}" in found.text
+
+
 def test_the_command_tells_why_no_time_was_used(tmp_path):
     log = written(tmp_path, {"t": damaged("swapped"), "pos_rad": X, "torque_Nm": U})
     (tmp_path / "log.csv").write_text(log.read_text().replace(f"{U[900]:.12g}\n", "ERR\n", 1))

@@ -220,3 +220,40 @@ def test_a_large_log_has_progress(tmp_path, monkeypatch, capfd, quiet):
         monkeypatch.setattr(sys, "argv", args)
         main()
         assert capfd.readouterr().err.splitlines() == (["reading log.csv", f"writing {tmp_path / 'd'}"] if told else [])
+
+
+@pytest.mark.parametrize(
+    ("cells", "why"),
+    [
+        (lambda k: "nan", "has no numbers"),
+        (lambda k: "on", "has 'on' in row 1"),
+        (lambda k: f"{k}.5/3", "has '0.5/3' in row 1"),
+    ],
+)
+def test_columns_that_a_guess_leaves_out_are_told(tmp_path, cells, why):
+    log = written(tmp_path, [f"{k / 100};{X[k]};{cells(k)}" for k in range(N)], "t;pos_rad;torque_Nm")
+    guessed = guess_map([log], "twomass")
+    assert guessed.missing == ("tau",) and guessed.warnings == (f"torque_Nm {why}: not used",)
+    assert f"#   torque_Nm: not read, as it {why}" in guessed.text
+    twice = written(tmp_path, [f"{X[k]};{X[k]};{-X[k]};{cells(k)}" for k in range(N)], "pos_rad;u_Nm;u_Nm;Zeit")
+    warnings = guess_map([twice], "twomass").warnings
+    assert (
+        f"Zeit {why}: not used" in warnings
+        and "u_Nm several columns that differ: the conversion will name it" in warnings
+    )
+
+
+def test_ranges_in_a_guess_are_those_of_the_numbers(tmp_path):
+    cells = [f"{k / 100};{X[k]};{'nan' if k % 100 == 0 else 20 + X[k]}" for k in range(N)]
+    assert "# tau: 19 to 21" in guess_map([written(tmp_path, cells, "t;pos_rad;torque_Nm")], "twomass").text
+    log = written(tmp_path, [c.replace(f";{X[k]};", ";;") for k, c in enumerate(cells)], "t;x;u")
+    with pytest.raises(DataError, match="found x without a number in it, expected numbers"):
+        converted(log)
+    np.savez(tmp_path / "log.npz", log=np.zeros(50, [("q", float), ("tau", float)]))
+    with pytest.raises(DataError, match=r"log has structures in place of numbers"):
+        guess_map([tmp_path / "log.npz"], "twomass")
+
+
+def test_rows_without_a_number_may_be_left_out(tmp_path):
+    with pytest.raises(DataError, match=r"found NaN of x at sample 5 .*rows without may be left out"):
+        converted(written(tmp_path, rows(lambda k, r: "0.1,nan" if k == 5 else r)))

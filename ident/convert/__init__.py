@@ -300,7 +300,8 @@ def _check_values(x: np.ndarray, c: Column, path: Path) -> None:
     if len(bad):
         kind = "NaN" if np.isnan(x[bad[0]]) else "infinity"
         found = f"{kind} of {c.source} at sample {bad[0]} ({len(bad)} not finite in all)"
-        raise DataError(name, str(path), found, "finite numbers")
+        expected = "finite numbers (rows without may be left out of a log with a time, as samples that were lost)"
+        raise DataError(name, str(path), found, expected)
     large = np.flatnonzero(np.abs(x) > LARGEST)
     if len(large):
         raise DataError(

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from ident.convert.guess_files import ReadLog, read_together
-from ident.convert.guess_names import choose, families_of
+from ident.convert.guess_names import choose, families_of, score, words_of
 from ident.convert.guess_order import joint_column
 from ident.convert.guess_text import Guess, plain, render
-from ident.convert.guess_time import FoundTime, find_time
+from ident.convert.guess_time import FoundTime, find_time, is_time
 from ident.convert.guess_units import Family, guess_scales, unwrapped
 from ident.convert.reading import Survey, survey_log
+from ident.convert.spelling import split_unit
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, linear_joints, load_robot
 
@@ -92,7 +93,7 @@ def guess_map(
     )
     found = {c: ", ".join((f.name, *scales[c].options)) for c, f in chosen.items()} | _found_time(log, time)
     missing = tuple(c for c in ("tau", "q") if c not in chosen)
-    return GuessedMap(text, found, missing, tuple(_warnings(log, time, chosen)))
+    return GuessedMap(text, found, missing, tuple(_warnings(log, time, chosen, missing)))
 
 
 def _unlike_a_log(path: Path, survey: Survey, families: Sequence[Family], time: FoundTime, arm: Robot) -> DataError:
@@ -126,8 +127,25 @@ def _found_time(log: ReadLog, time: FoundTime) -> dict[str, str]:
     return {"time": f"{sources}, {time.rate:g} Hz" + (f"; {time.doubt}" if time.doubt else "")}
 
 
-def _warnings(log: ReadLog, time: FoundTime, chosen: Mapping[str, Family]) -> list[str]:
-    """What a person should know about a guess, in words."""
+def _warnings(log: ReadLog, time: FoundTime, chosen: Mapping[str, Family], missing: Sequence[str] = ()) -> list[str]:
+    """What a person should know about a guess, in words; of channels that are missing too."""
     lost = [] if time.lost is None else [f"no time: {time.lost[0]} {time.lost[2]}"]
     used = [name for family in chosen.values() for name, _ in family.sources if name in log.doubts]
-    return [*lost, *log.warnings, *(f"{name} {log.doubts[name]}: the conversion will name it" for name in used)]
+    sought = [
+        name
+        for name in log.doubts
+        if name not in used and any(_may_be(name, channel, log.units.get(name)) for channel in missing)
+    ]
+    sought += [name for name in log.doubts if time.source is None and name not in log.signals and is_time(name)]
+    return [
+        *lost,
+        *log.warnings,
+        *(f"{name} {log.doubts[name]}: the conversion will name it" for name in used),
+        *(f"{plain(name)} has {plain(log.doubts[name])}: not used" for name in dict.fromkeys(sought)),
+    ]
+
+
+def _may_be(name: str, channel: str, unit: str | None) -> bool:
+    """Whether a signal may be one of a channel, by its name and unit."""
+    stem, own = split_unit(name)
+    return score(words_of(stem), channel, unit or own) > 0

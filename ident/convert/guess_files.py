@@ -68,7 +68,7 @@ def read_together(paths: Sequence[Path], surveys: Sequence[Survey], arm: Robot) 
         DataError: where no signal is long enough.
     """
     # Damaged values are no reason to guess nothing: the conversion names them.
-    logs = [{k: np.nan_to_num(np.clip(x, -LARGEST, LARGEST)) for k, x in s.signals.items()} for s in surveys]
+    logs = [{k: np.clip(_held(x), -LARGEST, LARGEST) for k, x in s.signals.items()} for s in surveys]
     parts = _parts(paths, logs, arm)
     starts = [f"{prefix}:" for prefix in parts] or [""]
 
@@ -103,6 +103,18 @@ def read_together(paths: Sequence[Path], surveys: Sequence[Survey], arm: Robot) 
         lists=named(lambda s: s.lists),
         warnings=warnings,
     )
+
+
+def _held(x: np.ndarray) -> np.ndarray:
+    """A signal whose values that are no numbers are those before them, or the first; zero where it has none."""
+    finite = np.isfinite(x)
+    if np.all(finite):
+        return x
+    rows, good = oriented(x), oriented(finite)
+    before = np.maximum.accumulate(np.where(good, np.arange(len(rows))[:, None], -1), axis=0)
+    out = np.take_along_axis(rows, np.where(before < 0, np.argmax(good, axis=0), before), axis=0)
+    out = np.where(np.any(good, axis=0), out, 0.0)
+    return out.reshape(x.shape) if x.ndim < 2 or out.shape == x.shape else out.T
 
 
 def length_of(x: np.ndarray) -> int:

@@ -179,9 +179,12 @@ def _multisine(guess: Guess) -> Iterator[str]:
 def _unused(guess: Guess) -> Iterator[str]:
     used = guess.time.sources | {f.name for f in guess.chosen.values()}
     unused = [f for f in guess.families if f.name not in used]
-    if unused:
+    read = {name for f in guess.families for name, _ in f.sources} | guess.time.sources
+    unread = [name for name in guess.doubts if name not in read]
+    if unused or unread:
         yield from ("", "# Not used:")
         yield from (f"#   {plain(f.name)}: {range_text(f.x)}" for f in unused[:MOST_UNUSED])
+        yield from (f"#   {plain(k)}: not read, as it has {plain(guess.doubts[k])}" for k in unread[:MOST_UNUSED])
 
 
 def _rate_note(time: FoundTime, joined: bool) -> str:

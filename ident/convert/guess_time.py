@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from ident.convert.guess_units import NAMED_UNITS, Family
 from ident.convert.quantities import KINDS, UNITS
 from ident.convert.rounding import Rounded, even_rows
+from ident.convert.spelling import split_unit
 
 RATES = (20.0, 50e3)  # Hz: a log of an arm is mostly sampled between
 SLOWEST, FASTEST = 0.1, 1e6  # Hz: no log of an arm is sampled beyond
@@ -80,6 +81,7 @@ def find_time(
     """
     best: tuple[tuple, FoundTime] | None = None
     lost: tuple[tuple, FoundTime] | None = None
+    useless: tuple[str, str, str] | None = None  # the first that has the name of a time and nothing else of it
     single = {f.name: f for f in families if f.x.shape[1] == 1}
     pairs = _pairs(single)
     for f in (*(p[0] for p in pairs), *single.values()):
@@ -90,6 +92,7 @@ def find_time(
         t = f.x[:, 0]
         step = np.diff(t)
         if not np.any(step > 0):
+            useless = useless or (f.name, "", "falls" if np.any(step < 0) else "is the same in all rows")
             continue
         names = {f.name, *(p[0] for p in plus)}
         trouble = next((f"has no number in row {damaged[n]}" for n in sorted(names) if n in damaged), "") or _goes_back(
@@ -97,6 +100,7 @@ def find_time(
         )
         # One that mostly rises is the time all the same, and told to be damaged; others only have such a name.
         if trouble and np.mean(step > 0) < 0.9:
+            useless = useless or (f.name, "", trouble)
             continue
         even = None if trouble else even_rows(t, [x for k, x in signals.items() if k not in names])
         median = float(np.median(step[step > 0])) if even is None else even.step
@@ -133,8 +137,9 @@ def find_time(
     for name, x in signals.items():
         power = SETTINGS.get(re.split(r"[.:]", name)[-1].lower())
         if power is not None and x.size == 1 and x.item() > 0 and RATES[0] <= x.item() ** power <= RATES[1]:
-            return FoundTime(rate=_round_rate(float(x.item() ** power), 1e-6), lost=lost[1].lost if lost else None)
-    return lost[1] if lost else FoundTime()
+            rate = _round_rate(float(x.item() ** power), 1e-6)
+            return FoundTime(rate=rate, lost=lost[1].lost if lost else useless)
+    return lost[1] if lost else FoundTime(lost=useless)
 
 
 def _coarse(step: np.ndarray, even: Rounded | None, unit: str, rate: float | None) -> str:
@@ -150,8 +155,18 @@ def _coarse(step: np.ndarray, even: Rounded | None, unit: str, rate: float | Non
 
 def _named(f: Family) -> bool:
     """Whether a name or its unit tells of a time."""
-    alone = bool(f.words) and all(NAMED_UNITS.get(w) in SECONDS for w in f.words)
-    return f.unit in SECONDS or alone or any(w in TIMES or w.startswith("time") for w in f.words)
+    return f.unit in SECONDS or _words_of_time(f.words)
+
+
+def is_time(name: str) -> bool:
+    """Whether the name of a column tells of a time."""
+    stem, unit = split_unit(name)
+    return unit in SECONDS or _words_of_time([w.lower() for w in re.findall(r"[A-Za-z]+", stem)])
+
+
+def _words_of_time(words: Sequence[str]) -> bool:
+    alone = bool(words) and all(NAMED_UNITS.get(w) in SECONDS for w in words)
+    return alone or any(w in TIMES or w.startswith("time") for w in words)
 
 
 def _goes_back(t: np.ndarray, step: np.ndarray) -> str:

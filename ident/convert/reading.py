@@ -68,6 +68,8 @@ def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Sig
     for name in sorted(wanted):
         if name not in data:
             known = sorted(NAMES.get(path.suffix.lower(), list_signals)(path))
+            if name in known:
+                raise DataError("signal", str(path), f"{name} without a number in it", "numbers")
             raise DataError("signal", str(path), f"no {name}", f"one of {known[:30]}")
         x = _array(data[name])
         if x is None or x.dtype.kind not in ("fiuMm" if name in times else "fiu"):
@@ -96,6 +98,8 @@ def survey_log(path: Path) -> Survey:
         x = _array(value)
         if (strings := _strings(value)) is not None:
             lists[name] = strings
+        if x is not None and x.dtype.kind == "V":
+            doubts[name] = "structures in place of numbers: save each field as an array"
         if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
         if x.dtype.kind in "Mm":
@@ -119,6 +123,8 @@ def _surveyed(
     for c in cells:
         if c.fault is not None:
             doubts[c.name] = f"{c.fault[1][:40]!r} in row {c.fault[0]}"
+        elif not c.kind:
+            doubts[c.name] = "no numbers"
         elif c.order[1]:
             doubts[c.name] = f"{c.like!r} taken as {'month/day' if c.order[0] == 'mdy' else 'day-month'}"
     out: dict[str, np.ndarray] = {}

@@ -6,7 +6,7 @@ import re
 
 SPELLED = {
     "rad": "rad", "radian": "rad", "radians": "rad", "mrad": "mrad", "deg": "deg", "degree": "deg", "degrees": "deg",
-    "°": "deg", "º": "deg", "grad": "deg", "rev": "rev", "turn": "rev", "turns": "rev",
+    "度": "deg", "弧度": "rad", "°": "deg", "º": "deg", "grad": "deg", "rev": "rev", "turn": "rev", "turns": "rev",
     "rad/s": "rad/s", "rads^1": "rad/s", "rads^-1": "rad/s", "deg/s": "deg/s", "degs^-1": "deg/s", "°/s": "deg/s", "º/s": "deg/s",
     "rpm": "rpm", "1/min": "rpm", "min^-1": "rpm", "u/min": "rpm", "r/min": "rpm", "rev/min": "rpm",
     "nm": "N m", "newtonmeter": "N m", "newtonmeters": "N m", "mnm": "mN m", "knm": "kN m", "n": "N", "kn": "kN",
