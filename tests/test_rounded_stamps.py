@@ -34,7 +34,7 @@ def converted(log, text):
 
 @pytest.mark.parametrize(
     ("rate", "by", "rounding"),
-    [(400.0, 1e-3, np.round), (125.0, 1e-2, np.round), (500.0, 1e-2, np.floor), (2000.0, 1e-3, np.floor), (60.0, 1e-2, np.floor), (100.0, 1.0, np.floor)],
+    [(400.0, 1e-3, np.round), (125.0, 1e-2, np.round), (500.0, 1e-2, np.floor), (2000.0, 1e-3, np.floor), (60.0, 1e-2, np.floor), (50.0, 1.0, np.floor)],
 )  # fmt: skip
 @pytest.mark.parametrize("name", ["t", "time_ms"])
 def test_even_rows_under_rounded_stamps_are_taken_as_even(tmp_path, rate, by, rounding, name):
@@ -97,6 +97,17 @@ def rows_of(kind):
 def test_other_rows_stay_where_their_stamps_are(kind, digits):
     t, q, tau = rows_of(kind)
     assert even_rows(np.round(t, digits), [q, tau]) is None
+
+
+def test_days_in_a_column_of_their_own_are_no_rounded_clock(tmp_path):
+    t = np.arange(N) / 200.0
+    q, tau = signals(t)
+    assert even_rows(86400.0 * (t > 7), [q, tau]) is None
+    clock = [f"23:59:{53 + s:09.6f}" if s < 7 else f"00:00:{s - 7:09.6f}" for s in t]
+    rows = (f"2026-02-{1 + (s >= 7)};{c};{x:.9g};{u:.9g}\n" for s, c, x, u in zip(t, clock, q, tau, strict=True))
+    (tmp_path / "log.csv").write_text("Date;Time;pos_rad;torque_Nm\n" + "".join(rows))
+    read = tomllib.loads(guess_map([tmp_path / "log.csv"], "twomass").text)
+    assert read["time"]["source"] == "Time" and read["sample_rate"] == 200.0
 
 
 def test_rows_of_which_the_guess_takes_a_part_are_told(tmp_path):

@@ -15,7 +15,7 @@ RARER = 0.01  # of the steps have the rarer size, at least, where it may as well
 DIFFER = 0.5  # of the rows that share a stamp with the one before, at least; else rows are repeated
 SMOOTHER = 1.1  # times the roughness at the stamps, above which signals tell that these are right
 LOOKED_AT = 200_000  # rows in which signals are looked at
-SHORTEST = 20  # rows
+SHORTEST = TICKS = 20  # rows, and times that their stamps rise, of a clock that can be told from a few jumps
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def even_rows(t: np.ndarray, signals: Sequence[np.ndarray], step: float | None =
         return None
     low = float(sizes.min())
     above = sizes[sizes > low + LEAST * (t[-1] - t[0]) / len(sizes)]
-    if not len(above):
+    if len(above) < TICKS:
         return None
     by = float(np.median(above)) - low
     gap = sizes > low + (1 + SAME) * by
