@@ -164,7 +164,7 @@ def predict_at(
     if steps is None:
         steps = REMAINDER_STEPS if W is None else 0
     if W is not None and W.shape[-1] != structure.n_coordinates:
-        W, steps = None, max(steps, REMAINDER_STEPS)
+        W, steps, torques = None, max(steps, REMAINDER_STEPS), Torques()
     filtered = any("filter" in e.hypothesis.options for e in model.effects)
     Q = true_position(group, par, sampling, partial(passed_by_filters, model) if filtered else None)
     by_channel: dict[str, list[Effect]] = {}

@@ -236,7 +236,7 @@ def solve(
         steps: on the remainder, at most; a start that is near ends them sooner.
 
     Raises:
-        FloatingPointError: the motion of the links runs away.
+        FloatingPointError: the motion of the links runs away, beside steps enough to solve it.
     """
     if Q is None:
         Q = true_position(group, par, sampling)
@@ -312,7 +312,8 @@ class _Search:
         steps: int,
         patience: int,
     ) -> tuple[np.ndarray, Torques, np.ndarray]:
-        """The nearest remainder found, torques with it, and the records that are not there yet.
+        """The remainder after all steps, or the nearest one where they lead nowhere, torques with it, and the records
+        that are not there yet.
 
         Args:
             left: records to solve.
@@ -342,6 +343,8 @@ class _Search:
                 return W, torques, left
             if stalled(changes, patience):
                 break
+        else:
+            return W, torques, left  # all steps were asked for: what the last one brings is not looked at
         return nearest, self.settled(nearest, begin), left
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.signal
 
 from ident.dataset import Dataset, Segment
 from ident.rest import difference_noise
 
 SEEN = 5.0  # rms of a channel over the noise of its samples, from which it can tell
 REPEATS = 0.5  # of what a channel does within a period, by which periods may differ
-TOGETHER = 0.1  # of what all positions do within a period, by which their last two may differ beyond noise
+TOGETHER = 0.25  # of what all positions do within a period, by which their last two may differ beyond noise
 
 
 def period_warnings(s: Segment, dataset: Dataset) -> list[str]:
@@ -33,13 +34,16 @@ def _otherwise_moved(s: Segment, dataset: Dataset) -> list[str]:
     """Positions that go another way in the last period than in the one before.
 
     Their second halves are compared, where transients have gone by, and all joints at once: one that is not excited
-    wanders by counts and friction, which is little beside what others do.
+    wanders by counts and friction, which is little beside what others do. A straight line between them is left out: so
+    does a transient that dies down slowly look.
     """
     x = s.periodic("q")[-2:]
-    x = x[:, x.shape[1] // 2 :] / dataset.robot.array("velocity_limit")
+    half = x.shape[1] // 2
+    x = x[:, half:] / dataset.robot.array("velocity_limit")
     x = x - x.mean(axis=1, keepdims=True)
     noise = difference_noise(s.q) / dataset.robot.array("velocity_limit")
-    differ = np.maximum(np.mean((x[1] - x[0]) ** 2, axis=0) / 2 - noise**2, 0.0)
+    off = scipy.signal.detrend(x[1] - x[0], axis=0)
+    differ = np.maximum(np.mean(off**2, axis=0) / 2 - noise**2, 0.0)
     within = float(np.sum(np.var(x.mean(axis=0), axis=0)))
     share = float(np.sqrt(differ.sum() / within)) if within > 0 else 0.0
     if share < TOGETHER:

@@ -11,6 +11,7 @@ import scipy.signal
 
 from ident.chain import Structure, build_structure
 from ident.dataset import Dataset, Segment
+from ident.recursion import chain_of, newton_euler
 from ident.rest import difference_noise
 
 LATEST = 0.03  # s: skews are looked for up to here from none,
@@ -297,13 +298,16 @@ def link_skew(s: Segment, dataset: Dataset) -> list[Skew]:
         return [UNKNOWN] * dataset.n
     _, _, v, _ = _band(s, rate)
     structure, edge = build_structure(dataset.robot), int(rate * SETTLED)
-    links = _low(np.where(np.all(np.isfinite(s.q_link), axis=0), s.q_link, s.q), rate)
+    # The zeros of link encoders are not known: the links swing about where the motors are.
+    swing = s.q_link - s.q
+    told = np.all(np.isfinite(swing), axis=0) & (np.ptp(s.q_link, axis=0) > 0)
+    links = _low(s.q + np.where(told, swing - swing.mean(axis=0), 0.0), rate)
     speed = np.gradient(links, 1 / rate, axis=0)
     a = np.gradient(speed, 1 / rate, axis=0)
-    data, full = structure.model.createData(), np.zeros((3, len(v), structure.model.nv))
+    full = np.zeros((3, len(v), structure.model.nv))
     for k, x in enumerate((links, speed, a)):
         full[k][:, structure.driven] = x
-    carried = np.array([pin.rnea(structure.model, data, *full[:, i]) for i in range(len(v))])[:, structure.driven]
+    carried = newton_euler(chain_of(structure.model), *full)[:, structure.driven]
     damped = np.gradient(carried, 1 / rate, axis=0)
     for j in range(dataset.n):
         link = s.q_link[:, j]

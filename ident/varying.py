@@ -12,7 +12,7 @@ that returns to itself after a period (Floquet).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
@@ -25,6 +25,7 @@ POINTS, MOST_POINTS = 8.0, 24.0  # of the time grid per line: as few, and as man
 # Newmark's beta: that of Fox and Goodwin (Proc. Camb. Phil. Soc. 45, 1949) puts resonances where they are to fourth order,
 # and stays bounded where no mode turns by more than sqrt(6) rad in a step; that of the trapezoidal rule always does
 FOURTH_ORDER, BOUNDED = 1.0 / 12.0, 0.25
+ROOM = 1 << 29  # bytes for the slopes of a group; records beyond go on by the arm at rest
 MOST_TURN, AIMED_TURN = 2.0, 1.2  # rad, along the motion and at rest
 LOOKED_AT = 16  # steps of time between looks at the modes
 STEP = 1e-6  # of a difference by position, rad, and by velocity, rad/s
@@ -36,7 +37,7 @@ class Varying:
 
     Attributes:
         records: (S,) which they are.
-        group: with the lines of the motion, on the time grid.
+        time_step: s.
         factors: (S, T, N, N) triangular factors of what resists an acceleration in a step of time.
         by_velocity, by_position: (S, T, N, N) slopes of the torque.
         beta: Newmark's.
@@ -46,7 +47,7 @@ class Varying:
     """
 
     records: np.ndarray
-    group: Group
+    time_step: float
     factors: np.ndarray
     by_velocity: np.ndarray
     by_position: np.ndarray
@@ -69,8 +70,8 @@ class Varying:
         return out
 
     def _answer(self, change: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        load = self.group.to_time(-change)
-        h = self.group.period_time / self.group.n_time
+        load = to_time(-change, self.factors.shape[1])
+        h = self.time_step
         moved = np.empty_like(load)
         N = load.shape[-1]
         for i, f, path in zip(rows, load, moved, strict=True):
@@ -80,7 +81,7 @@ class Varying:
             start = np.linalg.solve(np.eye(2 * N) - self.turn[i], end)
             march(*slopes, start, self._acceleration(i, start, f[0]), f, path)
         moved = np.roll(moved, 1, axis=1)  # the last point is the first of the next period
-        return -np.einsum("lab,slb->sla", self.at_rest, self.group.to_lines(moved))
+        return -np.einsum("lab,slb->sla", self.at_rest, to_lines(moved, len(self.at_rest)))
 
     def _acceleration(self, i: int, state: np.ndarray, load: np.ndarray) -> np.ndarray:
         q, v = np.split(state, 2)
@@ -101,26 +102,28 @@ def along(
     Args:
         spring, damper: (N,) at the coordinates, N m/rad and N m s/rad.
         rest: M, Kg (N, N) of the arm at rest, kg m2 and N m/rad.
-        records: (S,) which of the group's.
+        records: (S,) which of the group's; the first ones alone where there is no room for all.
         Q_a: (S, L, N) motion of their links, rad.
 
     Raises:
         FloatingPointError: no arm moves so.
     """
-    slow = group.slow()
-    lines, N = len(slow.omega), Q_a.shape[-1]
+    omega = group.omega[: group.n_slow]
+    lines, N = len(omega), Q_a.shape[-1]
     fastest = np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(rest[0], np.diag(spring) + rest[1])))).max()
     steps = np.clip(fastest * group.period_time / AIMED_TURN, POINTS * lines, MOST_POINTS * lines)
-    grid = replace(slow, n_time=scipy.fft.next_fast_len(int(steps), real=True))
-    s = 1j * slow.omega[:, None]
+    n_time = scipy.fft.next_fast_len(int(steps), real=True)
+    most = max(1, ROOM // (3 * 8 * n_time * N * N))
+    records, Q_a = records[:most], Q_a[:most, :lines]
+    s = 1j * omega[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
-        M, C, K = slopes(chain, *(grid.to_time(s**k * Q_a[:, :lines]) for k in range(3)))
+        M, C, K = slopes(chain, *(to_time(s**k * Q_a, n_time) for k in range(3)))
     if not all(np.all(np.isfinite(x)) for x in (M, C, K)):
         raise FloatingPointError("the links cannot be linearised along their motion")
     k = np.arange(N)
     C[..., k, k] += damper
     K[..., k, k] += spring
-    h = group.period_time / grid.n_time
+    h = group.period_time / n_time
     inertia = M[:, 0].copy()
     looks = (slice(None), slice(None, None, LOOKED_AT))
     fastest = np.abs(np.linalg.eigvals(np.linalg.solve(M[looks], K[looks]))).max()
@@ -132,14 +135,24 @@ def along(
     square = 2.0 / h * mean * rate
     of_rest = square * rest[0] + rate * np.diag(damper) + (np.diag(spring) + rest[1])
     turn = np.empty((len(Q_a), 2 * N, 2 * N))
-    out = Varying(records, grid, factors, C, K, beta, inertia, turn, of_rest)
-    nothing = np.zeros((grid.n_time, N))
+    out = Varying(records, h, factors, C, K, beta, inertia, turn, of_rest)
+    nothing = np.zeros((n_time, N))
     path = np.empty_like(nothing)
     for i in range(len(Q_a)):
         for j, state in enumerate(np.eye(2 * N)):
             a = out._acceleration(i, state, nothing[0])
             turn[i, :, j] = march(factors[i], C[i], K[i], h, beta, state, a, nothing, path)
     return out
+
+
+def to_time(X: np.ndarray, n_time: int) -> np.ndarray:
+    """Spectrum (..., L, N) on a grid of time (..., n_time, N)."""
+    return scipy.fft.irfft(X, n=n_time, axis=-2, norm="forward")
+
+
+def to_lines(x: np.ndarray, lines: int) -> np.ndarray:
+    """The first lines (..., lines, N) of a grid of time (..., T, N)."""
+    return scipy.fft.rfft(x, axis=-2, norm="forward")[..., :lines, :]
 
 
 def slopes(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

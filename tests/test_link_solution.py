@@ -17,6 +17,7 @@ from ident.inverse import (
     geometric_remainder,
     make_plane,
     solve,
+    static_remainder,
     true_position,
 )
 from ident.model import Model
@@ -41,6 +42,22 @@ def test_links_on_lightly_damped_gears_are_solved_along_large_motions(clean, mon
     assert len(looks) < 60
     left = geometric_remainder(structure, plane, group, found.Q_a) - found.W
     assert np.abs(left).max() < 1e-5 * np.abs(found.W).max()
+
+
+def test_a_step_that_is_asked_for_is_taken(clean):
+    """Differences to models near by stand on it."""
+    problem = set_up(clean[0]).problem
+    group = next(g for g in problem.groups if g.window is None)
+    structure, par = Model(problem.structure, problem.nominal).built
+    plane = make_plane(structure, par, group, problem.sampling)
+    far = static_remainder(structure, par, plane, group)
+    far[:, 1:40] += 1e-2 * np.abs(far).max()
+
+    def left(steps):
+        found = solve(structure, par, plane, group, problem.sampling, W=far, steps=steps)
+        return np.abs(geometric_remainder(structure, plane, group, found.Q_a) - found.W).max()
+
+    assert left(2) < 0.3 * left(1) and left(1) < 0.3 * left(0)
 
 
 def test_a_single_axis_without_a_remainder_takes_one_step(tmp_path, monkeypatch):

@@ -3,13 +3,18 @@ bounded."""
 
 import subprocess
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from ident.cli import main
 from ident.convert import convert_logs
+from ident.convert.cells import Cells
 from ident.convert.guess import guess_map
+from ident.convert.guess_text import period_of
 from ident.convert.reading import list_signals, read_log, survey_log
 from robot_assets.errors import DataError
 
@@ -257,3 +262,31 @@ def test_ranges_in_a_guess_are_those_of_the_numbers(tmp_path):
 def test_rows_without_a_number_may_be_left_out(tmp_path):
     with pytest.raises(DataError, match=r"found NaN of x at sample 5 .*rows without may be left out"):
         converted(written(tmp_path, rows(lambda k, r: "0.1,nan" if k == 5 else r)))
+
+
+@pytest.mark.parametrize("creep", [1e-3, 1.0])
+def test_a_joint_that_creeps_hides_no_period_and_makes_none(creep):
+    """Beside what the other does it is little, or the motion as a whole does not repeat."""
+    rng, t = np.random.default_rng(0), np.arange(20000)
+    wave = np.sin(2 * np.pi * t / 1000) + 0.5 * np.sin(6 * np.pi * t / 1000 + 1) + 0.01 * rng.normal(size=len(t))
+    drift = creep * np.sin(2 * np.pi * t / (2.2 * len(t)))
+    tau, q = np.stack([wave, 0.1 * wave], axis=1), np.stack([0.2 * wave, drift], axis=1)
+    found = period_of({"tau": SimpleNamespace(x=tau), "q": SimpleNamespace(x=q)})
+    assert found == (1000 if creep < 0.1 else None)
+
+
+@pytest.mark.parametrize("pieces", [(["1.234", "2.345"], ["500"]), (["500"], ["1.234", "2.345"])])
+def test_a_number_below_a_thousand_shows_thousands_in_whichever_piece_it_comes(pieces):
+    cells = Cells("q", Path("log.csv"), wanted=True, quoted=False, decimal=",")
+    for piece in pieces:
+        cells.take(pa.array(piece))
+    cells.end()
+    assert sorted(cells.array()) == [500.0, 1234.0, 2345.0]
+
+
+def test_an_empty_piece_says_nothing_of_the_order_of_day_and_month():
+    cells = Cells("time", Path("log.csv"), wanted=True, quoted=False)
+    for piece in (["11/02/2024 23:59:58"], ["", ""], ["11/03/2024 00:00:01"]):
+        cells.take(pa.array(piece))
+    found = cells.array()
+    assert [str(x)[:10] for x in found[[0, 3]]] == ["2024-11-02", "2024-11-03"]

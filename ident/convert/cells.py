@@ -80,6 +80,8 @@ class Cells:
         """
         if self._grouped is None or self._shown or self.kind != "numbers":
             return
+        if any(np.any(np.abs(part) < 1000) for part in self._parts):
+            return
         row, text = self.fault = self._grouped
         if self.wanted:
             found = f"{self.name} = {text[:60]!r} in row {row}, where decimals stand behind {self.decimal!r} elsewhere"
@@ -96,11 +98,12 @@ class Cells:
         return np.concatenate(parts)
 
     def _dates(self, column: pa.Array) -> np.ndarray:
-        order = date_order(column, self._above) if self.order[1] else self.order
+        written = column.null_count < len(column) and pc.any(pc.not_equal(column, "")).as_py()
+        order = date_order(column, self._above) if self.order[1] and written else self.order
         if order[0] != self.order[0]:  # above it was a guess
             self._parts = [day_and_month_swapped(p) if p.dtype.kind == "M" else p for p in self._parts]
         self.order = order
-        if order[1] and column.null_count < len(column):
+        if order[1] and written:
             self._above = _text(column.drop_null()[-1])
         return parse_dates(column, self.like, self.order)
 
@@ -151,11 +154,7 @@ class Cells:
             self._pointed = True  # a column with decimals of its own
             return column
         self._grouped = self._grouped or (self.rows + pc.index(column, signed[0]).as_py() + 1, _text(signed[0]).strip())
-        self._shown = (
-            self._shown
-            or bool(pc.any(pc.match_substring_regex(column, SHOWN[self.decimal])).as_py())
-            or any(bool(np.any(np.abs(part) < 1000)) for part in self._parts)
-        )
+        self._shown = self._shown or bool(pc.any(pc.match_substring_regex(column, SHOWN[self.decimal])).as_py())
         return pc.replace_substring(column, other, "")
 
     def _refuse(self, column: pa.Array) -> None:

@@ -219,29 +219,32 @@ def period_of(chosen: Mapping[str, Family]) -> int | None:
     start = int(np.flatnonzero(c > 0.97 * c.max())[0])
     below = np.flatnonzero(c[start:] < 0.9 * c.max())
     end = start + (int(below[0]) if len(below) else len(c) - start)
-    period = int(lags[start + int(np.argmax(c[start:end]))])
-    columns = [column for k in ("tau", "q") if k in chosen for column in chosen[k].x[:LONGEST_PERIODIC].T]
-    moving = [x for x in columns if np.ptp(x[period:]) > 0]
-    if not moving:
+    hill = lags[start:end]
+    period = int(hill[np.argmax(c[start:end])])
+    channels = [chosen[k].x[:LONGEST_PERIODIC] for k in ("tau", "q") if k in chosen]
+    moving = [x for x in channels if np.any(np.ptp(x[period:], axis=0) > 0)]
+    if not moving or any(_change(x, period) > UNLIKE**2 for x in moving):
         return None
-    # The top of a smooth hill is blurred by noise, of which one column has the least.
-    clear = min(moving, key=_noise_share)
+    # The top of a smooth hill is blurred by noise, of which one of the columns that repeat has the least.
+    columns = [x for x in np.concatenate(moving, axis=1).T[..., None] if np.ptp(x[period:]) > 0]
+    clear = min((x for x in columns if _change(x, period) <= UNLIKE**2), key=_noise_share)
     near = 0
     while near != period:
-        near, period = period, min(range(max(16, period - 2), min(period + 3, N // 3)), key=lambda p: _change(clear, p))
+        about = [p for p in range(period - 2, period + 3) if hill[0] <= p <= hill[-1]]
+        near, period = period, min(about, key=lambda p: _change(clear, p))
     return period if all(_change(x, period) <= UNLIKE**2 for x in moving) else None
 
 
 def _noise_share(x: np.ndarray) -> float:
-    """Variance of white noise in a signal (N,), of which third differences have 20 times, over that of the signal."""
-    return float(np.mean(np.diff(x, 3) ** 2) / 20 / np.var(x))
+    """Variance of white noise in signals (N, n), of which third differences have 20 times, over that of the signals."""
+    return float(np.mean(np.diff(x, 3, axis=0) ** 2) / 20 / np.mean(np.var(x, axis=0)))
 
 
 def _change(x: np.ndarray, period: int) -> float:
-    """What a signal (N,) differs by from the period before, its noise apart, over its variance; after the first period,
-    which has the transient."""
+    """What signals (N, n) of all joints differ by from the period before, their noise apart, over their variance; after
+    the first period, which has the transient. A joint that is not excited creeps, by little beside the others."""
     x = x[period:]
-    return float(np.mean((x[period:] - x[:-period]) ** 2) / np.var(x)) - 2 * _noise_share(x)
+    return float(np.mean((x[period:] - x[:-period]) ** 2) / np.mean(np.var(x, axis=0))) - 2 * _noise_share(x)
 
 
 def plain(text: str, most: int = 120) -> str:
