@@ -271,12 +271,11 @@ class Group:
 
     def to_time(self, X: np.ndarray) -> np.ndarray:
         """Spectrum (..., L, m) on the time grid (..., n_time, m)."""
-        return scipy.fft.irfft(X, n=self.n_time, axis=-2, norm="forward")
+        return to_time(X, self.n_time)
 
     def to_lines(self, x: np.ndarray) -> np.ndarray:
         """Time grid (..., n_time, m) to spectrum (..., L, m)."""
-        full = scipy.fft.rfft(x, axis=-2, norm="forward")
-        return full[..., : len(self.omega), :]
+        return to_lines(x, len(self.omega))
 
     @cached_property
     def _seen(self) -> tuple[np.ndarray, np.ndarray]:
@@ -311,6 +310,16 @@ class Group:
             flat = flat.copy()
             flat[:, 0, first:] -= np.einsum("t,stm->sm", share, self.to_time(flat[..., first:]))
         return self.observe(flat).reshape(len(X), self.n_compared, *X.shape[2:])
+
+
+def to_time(X: np.ndarray, n_time: int) -> np.ndarray:
+    """Spectrum (..., L, m) on a grid of time (..., n_time, m)."""
+    return scipy.fft.irfft(X, n=n_time, axis=-2, norm="forward")
+
+
+def to_lines(x: np.ndarray, lines: int) -> np.ndarray:
+    """The first lines (..., lines, m) of a signal on a grid of time (..., T, m)."""
+    return scipy.fft.rfft(x, axis=-2, norm="forward")[..., :lines, :]
 
 
 def line_noise(X_periods: np.ndarray, white: np.ndarray) -> np.ndarray:

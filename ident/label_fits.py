@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 
 from ident.chain import Structure
+from ident.recursion import chain_of, newton_euler
 
 INSTANTS = 300  # of a motion compared
 TELLS = 0.5  # share of a torque left unexplained, above which its joint tells nothing
@@ -70,20 +70,18 @@ class Motion:
 
     def of_itself(self) -> np.ndarray:
         """(N, n) torque that each joint needs for its own acceleration."""
-        model, driven = self.structure.model, self.structure.driven
-        data, full = model.createData(), np.zeros((len(self.q), model.nv))
-        full[:, driven] = self.q
-        links = np.array([np.diag(pin.crba(model, data, q)) for q in full])[:, driven]
-        return (links + self.inertia) * self.a
+        still = np.zeros_like(self.q)
+        held = self.needed(self.q, still, still)
+        alone = [self.needed(self.q, still, self.a * unit)[:, j] for j, unit in enumerate(np.eye(self.q.shape[1]))]
+        return np.stack(alone, axis=1) - held
 
     def needed(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """(N, n) torque that bodies, gravity and motors need."""
         model, driven = self.structure.model, self.structure.driven
-        data, full = model.createData(), np.zeros((3, len(q), model.nv))
+        full = np.zeros((3, len(q), model.nv))
         for k, x in enumerate((q, v, a)):
             full[k][:, driven] = x
-        rigid = np.array([pin.rnea(model, data, *full[:, i]) for i in range(len(q))])[:, driven]
-        return rigid + a * self.inertia
+        return newton_euler(chain_of(model), *full)[:, driven] + a * self.inertia
 
     def own(self, j: int, spring: bool = False) -> np.ndarray:
         """(N, k) friction and offset of a joint, and a spring at it."""

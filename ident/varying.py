@@ -18,7 +18,7 @@ import numpy as np
 import scipy.fft
 from numba import njit
 
-from ident.group import Group
+from ident.group import Group, to_lines, to_time
 from ident.recursion import Chain, newton_euler
 
 POINTS, MOST_POINTS = 8.0, 24.0  # of the time grid per line: as few, and as many where modes are faster than lines
@@ -110,7 +110,8 @@ def along(
     """
     omega = group.omega[: group.n_slow]
     lines, N = len(omega), Q_a.shape[-1]
-    fastest = np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(rest[0], np.diag(spring) + rest[1])))).max()
+    inertia_at_rest, held = rest[0], np.diag(spring) + rest[1]
+    fastest = np.sqrt(np.abs(np.linalg.eigvals(np.linalg.solve(inertia_at_rest, held)))).max()
     steps = np.clip(fastest * group.period_time / AIMED_TURN, POINTS * lines, MOST_POINTS * lines)
     n_time = scipy.fft.next_fast_len(int(steps), real=True)
     most = max(1, ROOM // (3 * 8 * n_time * N * N))
@@ -133,7 +134,7 @@ def along(
     mean = np.tanh(0.5 * h * s)[..., None]
     rate = 2.0 / h * mean / (1.0 - (1.0 - 4.0 * beta) * mean**2)
     square = 2.0 / h * mean * rate
-    of_rest = square * rest[0] + rate * np.diag(damper) + (np.diag(spring) + rest[1])
+    of_rest = square * inertia_at_rest + rate * np.diag(damper) + held
     turn = np.empty((len(Q_a), 2 * N, 2 * N))
     out = Varying(records, h, factors, C, K, beta, inertia, turn, of_rest)
     nothing = np.zeros((n_time, N))
@@ -143,16 +144,6 @@ def along(
             a = out._acceleration(i, state, nothing[0])
             turn[i, :, j] = march(factors[i], C[i], K[i], h, beta, state, a, nothing, path)
     return out
-
-
-def to_time(X: np.ndarray, n_time: int) -> np.ndarray:
-    """Spectrum (..., L, N) on a grid of time (..., n_time, N)."""
-    return scipy.fft.irfft(X, n=n_time, axis=-2, norm="forward")
-
-
-def to_lines(x: np.ndarray, lines: int) -> np.ndarray:
-    """The first lines (..., lines, N) of a grid of time (..., T, N)."""
-    return scipy.fft.rfft(x, axis=-2, norm="forward")[..., :lines, :]
 
 
 def slopes(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

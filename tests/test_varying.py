@@ -8,11 +8,12 @@ import pytest
 
 from ident.chain import build_structure
 from ident.graybox import damping_diagonal, linearise, stiffness_diagonal
+from ident.group import to_time
 from ident.identification import set_up
 from ident.inverse import inverse_dynamics
 from ident.model import Model
 from ident.recursion import chain_of
-from ident.varying import BOUNDED, FOURTH_ORDER, along, factorised, march, slopes, to_time
+from ident.varying import BOUNDED, FOURTH_ORDER, along, factorised, march, slopes
 from robot_assets.robot import load_robot
 
 
