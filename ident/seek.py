@@ -82,9 +82,13 @@ def seek(
         return replace(linked, late=workers.late)
     foretell = not mislabelled and setup.problem.motions_alone and inertias_foretell(setup)
     first_search = workers.for_half() if foretell else workers  # causes are then sought beside these inertias too
+    guess = setup.problem.tau_std
     setup, baseline, result = sought(dataset, setup, baseline, max_causes, workers, first_search)
     if linked is not None and linked.result.detected and not result.detected:
-        return replace(linked, late=linked.late or first_search.late)
+        if np.any(setup.problem.tau_std > guess) and not workers.late:  # what both show may be that noise as well
+            linked = by_link_encoders(dataset, setup, baseline, max_causes, workers)
+        if linked is not None and linked.result.detected:
+            return replace(linked, late=linked.late or first_search.late)
     found = Sought(setup, recorded, baseline, result, setup.problem.nominal, late=first_search.late)
     if foretell and unresolved(result) and not workers.late:
         return with_inertias(found, max_causes, workers)

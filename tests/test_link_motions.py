@@ -5,18 +5,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from ident.conclude import _late
 from ident.coordinates import pack, unpack
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose, diagnose_fully
 from ident.hypotheses import catalogue
-from ident.identification import set_up
+from ident.identification import identify, set_up
 from ident.link_sensor import LinkDelay, comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect, Model
 from ident.parallel import Workers
 from ident.problem import data_count, data_counts, predictions
-from ident.seek import by_link_encoders
+from ident.seek import by_link_encoders, seek
 from ident.weights import make_weights
 from sim.effects import parse_effect
 from sim.experiment import draw_drives
@@ -91,6 +92,28 @@ def test_torque_and_links_are_weighed_under_the_noise_that_the_torque_has_shown(
     asked = both.result
     assert asked is both.setup.problem and asked.sampling == told.sampling and asked.groups[0].links
     assert np.array_equal(asked.q_std, told.q_std) and np.array_equal(asked.tau_std, told.tau_std)
+
+
+def test_noise_that_only_the_torque_tells_is_no_cause_of_link_encoders_either(still, ur10, monkeypatch):
+    """Of torque noise whose samples go together differences tell too little; the fast lines of motions show it then,
+    and link encoders are asked again under that."""
+    rng, segments = np.random.default_rng(7), []
+    for segment in still.segments:
+        white = 20.0 * ur10.array("tau_std") * rng.normal(size=segment.tau.shape)
+        coloured = scipy.signal.lfilter([np.sqrt(1.0 - 0.9**2)], [1.0, -0.9], white, axis=0)
+        segments.append(replace(segment, tau=segment.tau + coloured))
+    data = replace(still, segments=tuple(segments), q_std=None, tau_std=None)
+    setup, baseline = identify(data)
+    asked = []
+
+    def spied(dataset, setup, *rest):
+        asked.append(by_link_encoders(dataset, setup, *rest))
+        return asked[-1]
+
+    monkeypatch.setattr("ident.seek.by_link_encoders", spied)
+    found = seek(data, setup, baseline, 0, Workers())
+    assert [x.result.detected for x in asked] == [True, False]
+    assert not found.result.detected
 
 
 def test_links_move_with_the_drives_as_the_jacobian_says(still):
