@@ -237,7 +237,7 @@ def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fi
     q_std, tau_std = (
         std * factor if r else std for std, r in zip((problem.q_std, problem.tau_std), raised, strict=True)
     )
-    return replace(problem, q_std=q_std, tau_std=tau_std)
+    return replace(problem, q_std=q_std, tau_std=tau_std, noise_denied=not any(guessed))
 
 
 def under_noise_that_is_left(

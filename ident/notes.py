@@ -44,7 +44,7 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
     closed = (
         ""
         if gain is None or gain.gap_closed is None or not of_torque
-        else f"; naming {'them' if others else 'it'} closes {gain.gap_closed:.1%} of the gap to the noise on held-out data"
+        else f"; naming {'them' if others else 'it'} closes {min(gain.gap_closed, 1.0):.1%} of the gap to the noise on held-out data"
     )
     rest = ", and an unknown cause remains" if unknown else f"; not for sure {possible}" if possible else ""
     return f"The simulation misses {names}{closed}{rest}."

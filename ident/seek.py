@@ -17,9 +17,11 @@ from ident.group import Group
 from ident.hypotheses.sensing import torque_offset
 from ident.identification import (
     Setup,
+    guessed_noise,
     set_up,
     under_noise_beside_causes,
     with_noise_of_fast_lines,
+    with_noise_of_unexcited_lines,
     with_steps_of,
 )
 from ident.late_excitation import acting
@@ -175,11 +177,16 @@ def under_more_noise(setup: Setup, noisy: Problem, max_causes: int, workers: Wor
 
 
 def louder(dataset: Dataset, problem: Problem, fit: Fit) -> Problem:
-    """``with_noise_of_fast_lines``; the problem itself where there is no such model."""
+    """The problem under more noise than is given or was guessed, where a fit shows it: at the fast lines of motions
+    (``with_noise_of_fast_lines``), or, where noise is given, beside causes at the lines that nothing excites
+    (``with_noise_of_unexcited_lines``); the problem itself where there is no such model."""
     try:
-        return with_noise_of_fast_lines(dataset, problem, fit)
+        noisy = with_noise_of_fast_lines(dataset, problem, fit)
+        if noisy is problem and fit.model.effects and not any(guessed_noise(dataset)):
+            noisy = with_noise_of_unexcited_lines(dataset, problem, fit)
     except NOT_COMPUTED:
         return problem
+    return noisy
 
 
 def beside_steady_records(
