@@ -27,6 +27,7 @@ SAME = 1e-9  # of the largest value: signals that differ by less are one
 CHANGES = 10  # of a signal, from which it can be known again
 CLIPPED = 3e-3  # share of the samples at the very largest value, in runs of three or more
 SMOOTH = 1e-5  # torque noise over torque rms, below which a log was filtered
+BEYOND = 1.1  # largest torque over the limit of its drive, that noise and overshoot do not explain
 MOVES = 3.0  # standard deviation of a position over its noise
 LOW_SHARE = 0.1  # of the sample rate
 ALIKE = 3  # samples in all channels, and times as many as are alike all along, that are a freeze in motion
@@ -87,6 +88,10 @@ def unit_warnings(s: Segment, dataset: Dataset) -> list[str]:
         if known and top > 3 * limits[j]:
             out.append(
                 f"tau_{j + 1} ({name}) reaches {top:.4g} {newton}, its limit is {limits[j]:.4g}: wrong unit or side of the gear?"
+            )
+        elif known and top > BEYOND * limits[j]:
+            out.append(
+                f"tau_{j + 1} ({name}) reaches {top:.4g} {newton}, beyond its limit of {limits[j]:.4g}: does the drive saturate there, or has it another limit?"
             )
         elif known and 0 < top < 2e-3 * limits[j] and not alike:
             out.append(

@@ -15,6 +15,9 @@ from robot_assets.robot import Robot
 
 DRAWS = 100  # random phases tried for the lowest crest factor
 MOTION = 0.010  # rad rms, motor motion aimed at for level 1
+LEAST_TORQUE = 10.0  # rms of the torque of level 1 over the noise of its sensor, for which a motor may move further
+MOST_MOTION = 0.1  # rad or m rms, then
+RANGE_SHARE = 0.05  # of the range of a joint that such a motion may have, rms
 TORQUE_SHARE = 0.6  # of the torque limit that gravity and excitation may take together
 SPEED_SHARE = 0.5  # of the velocity limit
 LOOP_HZ = 2.5  # bandwidth assumed of the position loop that holds a posture
@@ -117,8 +120,8 @@ def shape_amplitudes(
 ) -> np.ndarray:
     """Amplitudes (F, n) of lines: torque that moves every motor alike up to a corner, then falls.
 
-    Scaled so that the predicted motor motion is ``MOTION`` rad rms and speed and torque stay
-    within their shares of the limits.
+    Scaled so that the predicted motor motion is ``MOTION`` rad rms, or as much more (to ``MOST_MOTION``) as lifts the
+    torque of a light drive out of its noise, and speed and torque stay within their shares of the limits.
 
     Args:
         inertia: (n,) kg m2 that a motor moves, its own included.
@@ -135,6 +138,9 @@ def shape_amplitudes(
     motion = shape / (inertia * np.hypot(w**2, (2 * np.pi * LOOP_HZ) ** 2))
     size = MOTION / np.sqrt(0.5 * np.sum(motion**2, axis=0))
     rms = size * np.sqrt(0.5 * np.sum(shape**2, axis=0))
+    most = np.maximum(np.minimum(MOST_MOTION, RANGE_SHARE * (robot.q_max - robot.q_min)), MOTION)
+    more = np.clip(LEAST_TORQUE * robot.array("tau_std") / rms, 1.0, most / MOTION)
+    size, rms = size * more, rms * more
     size = size * np.minimum(1.0, headroom / (3.5 * rms))
     speed = size * np.sqrt(0.5 * np.sum((motion * w) ** 2, axis=0))
     size = size * np.minimum(1.0, SPEED_SHARE * robot.array("velocity_limit") / (3.5 * speed))

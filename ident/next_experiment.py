@@ -34,9 +34,10 @@ from robot_assets.robot import linear_joints
 TIED = 0.1  # probability from which a second hypothesis is worth an experiment
 ENOUGH = 5.0  # nats of expected evidence that settle a tie
 FACTORS = (0.25, 0.5, 1.0, 2.0)  # on the motion of the largest level
-SHIFTS = (-0.6, 0.0, 0.6)  # rad or m of the joint in question
+SHIFTS = (-1.0, 0.0, 1.0)  # of the joint in question, in units of the longest
+LONGEST_SHIFT, RANGE_SHARE = 0.6, 0.3  # rad or m, and of the range of the joint
 RECORDS = 6  # of a posture that are looked at
-TORQUE_SHARE = 0.9  # of the torque limit that a planned motion may take
+TORQUE_SHARE = 0.65  # of the torque limit that a planned motion may take once it is steady: it begins with more
 LEVELS = (1.0, 0.5, 0.25)  # of a planned experiment, in units of the largest
 MANY = 1000.0  # nats above which their number says no more: it is of first order
 
@@ -91,24 +92,27 @@ def separating_experiment(problem: Problem, result: Attribution) -> NextExperime
     a, b = pair
     options = list(_options(problem, groups, a.hypothesis.joint))
     nats = map_threads(lambda option: _separation(problem, option, a.fit, b.fit), options)
-    best = int(np.argmax(nats))
+    most = max(nats, default=0.0)
     names = " from ".join(f"{told_name(c, problem.groups)} at {c.hypothesis.place}" for c in pair)
-    if not nats[best] > ENOUGH:
+    if not most > ENOUGH:
+        other = "A wider band or a slow sweep may."
+        if any(c.hypothesis.effect == "torque_constant" for c in pair):
+            other = "The same with a load of known mass may."
         text = (
             f"To tell {names}: no other amplitude or posture would; of {len(options)} experiments the best is expected"
-            f" to give {max(nats[best], 0.0):.1f} nats. A wider band or a slow sweep may."
+            f" to give {max(most, 0.0):.1f} nats. {other}"
         )
-        return NextExperiment(text, float(nats[best]), None)
-    o = options[best]
+        return NextExperiment(text, most, None)
+    o = options[int(np.argmax(nats))]
     robot = problem.structure.robot
     unit = "m" if linear_joints(robot)[o.joint] else "rad"
     where = f"the posture of {o.group.operating_point}" + (
-        f" with {robot.joint_names[o.joint]} moved by {o.shift:+g} {unit}" if o.shift else ""
+        f" with {robot.joint_names[o.joint]} moved by {o.shift:+.2g} {unit}" if o.shift else ""
     )
     size = "the same amplitude" if o.factor == 1.0 else f"{o.factor:g} times the amplitude"
-    expected = f"{nats[best]:.0f}" if nats[best] < MANY else f"more than {MANY:.0f}"
+    expected = f"{most:.0f}" if most < MANY else f"more than {MANY:.0f}"
     text = f"To tell {names}: {where}, at {size}; expected to give {expected} nats between them (next_plan.toml)."
-    return NextExperiment(text, float(nats[best]), _plan(problem, o))
+    return NextExperiment(text, most, _plan(problem, o))
 
 
 def _rivals(result: Attribution, groups: Sequence[Group]) -> tuple[Candidate, Candidate] | None:
@@ -135,13 +139,14 @@ def _options(problem: Problem, groups: Sequence[Group], joint: int) -> Iterator[
         rows = np.argsort(-group.amplitude, kind="stable")[:RECORDS]
         top = group.pick(rows[group.amplitude[rows] == group.amplitude.max()])
         for j in range(robot.n) if joint < 0 else (joint,):
+            longest = min(LONGEST_SHIFT, RANGE_SHARE * (robot.q_max[j] - robot.q_min[j]))
             for factor in (1.0,) if joint < 0 else FACTORS:
                 if factor > 1.0 and np.any(np.abs(top.U[:, 0]).max(axis=0) + factor * _peak(top) > limit):
                     continue
-                for shift in SHIFTS:
+                for shift in longest * np.array(SHIFTS):
                     inside = robot.q_min[j] < top.posture[j] + shift < robot.q_max[j]
                     if (factor, shift) != (1.0, 0.0) and (inside or shift == 0.0):
-                        yield _Option(moved(top, factor, j, shift), factor, j, shift)
+                        yield _Option(moved(top, factor, j, shift), factor, j, float(shift))
 
 
 def moved(group: Group, factor: float, joint: int, shift: float) -> Group:

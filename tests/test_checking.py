@@ -114,6 +114,10 @@ FAULTS = {
     "velocity of the wrong sign": (lambda s: replace(s, qd=change(s.qd, 1, np.negative)), "qd_2"),
     "link encoder in degrees": (lambda s: replace(s, q_link=change(s.q_link, 0, np.rad2deg)), "q_link_1"),
     "no torque": (lambda s: replace(s, tau=change(s.tau, 3, np.zeros_like)), "tau_4 (wrist_1_joint) is frozen"),
+    "torque beyond its limit": (
+        lambda s: replace(s, tau=change(s.tau, 5, lambda x: x + 70.0)),
+        "tau_6 (wrist_3_joint) reaches 7",
+    ),
     "torque clipped": (lambda s: replace(s, tau=np.clip(s.tau, -140, 140)), "tau_2 (shoulder_lift_joint) is clipped"),
     "torque frozen": (
         lambda s: replace(s, tau=change(s.tau, 1, frozen)),

@@ -1615,6 +1615,14 @@ def test_bounds_say_how_large_a_pure_number_may_be_and_no_other(unit, spread):
     assert q.bounded == (unit == "1")
 
 
+@pytest.mark.parametrize(("value", "spread"), [(0.97, -np.log(0.97)), (1.03, np.log(1.03)), (4.9, LOG_SPREAD)])
+def test_a_factor_is_as_large_as_it_differs_from_none(value, spread):
+    """Charged for all sizes that it may have, a torque constant that is slightly off had lost against a load."""
+    q = Parameter("scale", "1", 0.2, 5.0, log=True, null=1.0)
+    assert q.expected_spread(value) == pytest.approx(spread)
+    assert replace(q, null=None).expected_spread(value) == LOG_SPREAD
+
+
 @pytest.mark.parametrize(("left", "fitted"), [(0.99, 1), (0.5, 2)])
 def test_candidates_that_hardly_explain_anything_after_a_few_steps_are_fitted_no_further(
     identified, monkeypatch, left, fitted

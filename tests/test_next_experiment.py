@@ -9,7 +9,7 @@ import pytest
 from ident.evidence import Candidate
 from ident.hypotheses import catalogue
 from ident.model import Effect, Model
-from ident.next_experiment import _Option, _separation, advice, moved, separating_experiment
+from ident.next_experiment import _Option, _options, _separation, advice, moved, separating_experiment
 from ident.plan_file import plan_from_toml, plan_to_toml
 from ident.torque_fit import fit
 
@@ -89,6 +89,27 @@ def test_the_plan_is_one_that_the_arm_can_run(fitted, tmp_path):
     ) == 3
     q0 = again.experiments[0].q0
     assert np.all(q0 > robot.q_min) and np.all(q0 < robot.q_max)
+
+
+@pytest.mark.parametrize("joint", [-1, 2])
+def test_an_axis_is_moved_by_no_more_than_it_has_room_for(fitted, joint):
+    problem = fitted[0]
+    groups = [g for g in problem.groups if g.window is None]
+    robot, at = problem.structure.robot, groups[0].posture
+    short = replace(robot, q_min=at - 0.1, q_max=at + 0.1)
+    options = list(_options(SimpleNamespace(structure=SimpleNamespace(robot=short)), groups[:1], joint))
+    assert {round(o.shift, 9) for o in options} >= {-0.06, 0.06} and all(abs(o.shift) < 0.061 for o in options)
+
+
+def test_where_no_experiment_can_be_made_none_is_planned(fitted, monkeypatch):
+    """A load on a single axis has no other posture, and is its torque constant to every motion."""
+    problem, _, (gear, hard), (rub, friction) = fitted
+    scaled = replace(rub, effect="torque_constant")
+    candidates = (Candidate(gear, hard, 0.0, 0.55), Candidate(scaled, friction, -0.2, 0.45))
+    monkeypatch.setattr("ident.next_experiment._options", lambda *args: iter(()))
+    found = separating_experiment(problem, SimpleNamespace(rounds=(SimpleNamespace(candidates=candidates),)))
+    assert found.plan is None and found.nats == 0.0 and "of 0 experiments" in found.text
+    assert "known mass" in found.text
 
 
 def test_a_sure_cause_asks_for_nothing(fitted):

@@ -73,11 +73,13 @@ class Parameter:
         return self.unit == "1" and self.upper - self.lower <= UNIT_RANGE
 
     def expected_spread(self, value: float) -> float:
-        """Standard deviation before the data, fitted coordinates: of the size of the value where nothing is said."""
+        """Standard deviation before the data, fitted coordinates: where nothing is said the size of the value, of a
+        factor that by which it differs from none."""
         if np.isfinite(self.spread):
             return self.spread
         if self.log:
-            return LOG_SPREAD
+            off = LOG_SPREAD if self.null is None else abs(self.to_internal(value) - self.to_internal(self.null))
+            return min(max(off, 1e-300), LOG_SPREAD)
         if self._pure:
             return (self.upper - self.lower) / np.sqrt(12.0)
         return max(abs(value), 1e-300)
