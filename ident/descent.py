@@ -118,7 +118,8 @@ class Criterion:
 def descend(
     criterion: Criterion, at: Point, H: np.ndarray, b: np.ndarray, damping: float, anew: bool
 ) -> tuple[Step | None, float]:
-    """A step that lowers the criterion, and the damping that it took; None where no damping does.
+    """A step that lowers the criterion, and the damping that it took; None where no damping does, in all coordinates or
+    in those that are no ``nuisances``.
 
     Args:
         H, b: normal equations of the weighted squares at that point, (p, p) and (p,).
@@ -127,12 +128,28 @@ def descend(
     """
     if criterion.share:
         b = b - criterion.share * shared_slope(criterion.problem, at.model, at.predictions, criterion.weights)
+    step, found = _tried(criterion, at, H, b, damping, anew, np.ones(len(at.x), bool))
+    free = ~nuisances(at.model)
+    if step is None and not np.all(free) and not is_slow(at.model) and _foretold(criterion, at, H, b, free) > SLIGHT:
+        # A law may jump with one of them, as a friction does where rest is no longer told from a slow turn, and no step
+        # leads there.
+        step, _ = _tried(criterion, at, H, b, damping, anew, free)
+    return step, found if step is None else damping
+
+
+def _tried(
+    criterion: Criterion, at: Point, H: np.ndarray, b: np.ndarray, damping: float, anew: bool, free: np.ndarray
+) -> tuple[Step | None, float]:
+    """``descend`` in the coordinates that are ``free`` (p,), by the whole slope ``b``."""
     off, prior = at.x - criterion.center, criterion.prior
     H_p, b_p = H + np.diag(prior), b - prior * off
     size = np.diag(H_p).copy()
     size[size <= 0] = 1.0
+    among = np.ix_(free, free)
     for _ in range(TRIALS):
-        step = criterion.cut(at, np.linalg.solve(H_p + damping * np.diag(size), b_p))
+        step = np.zeros(len(b))
+        step[free] = np.linalg.solve((H_p + damping * np.diag(size))[among], b_p[free])
+        step = criterion.cut(at, step)
         to = criterion.stepped(at, step, anew)
         gain = at.value - to.value if to is not None else -np.inf
         foretold = float(2.0 * b @ step - step @ H @ step)
@@ -143,6 +160,19 @@ def descend(
             break
         damping = max(damping, LEAST_RAISED) * MORE_DAMPING
     return None, damping
+
+
+def _foretold(criterion: Criterion, at: Point, H: np.ndarray, b: np.ndarray, free: np.ndarray) -> float:
+    """Fall of the criterion that its slope says of the best step in the ``free`` coordinates."""
+    prior = criterion.prior
+    slope = (b - prior * (at.x - criterion.center))[free]
+    return float(slope @ np.linalg.lstsq((H + np.diag(prior))[np.ix_(free, free)], slope, rcond=None)[0])
+
+
+def nuisances(model: Model) -> np.ndarray:
+    """(p,) which coordinates of a fit are parameters of effects that only say in what form these act."""
+    own = len(model.par.to_log()) + 1
+    return np.array([False] * own + [q.nuisance for e in model.effects for q in e.hypothesis.parameters])
 
 
 def is_slow(model: Model) -> bool:

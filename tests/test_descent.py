@@ -1,0 +1,69 @@
+"""Steps of a fit: closed cases on a paraboloid."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ident.descent import Criterion, Point, descend, nuisances
+
+CURVATURE = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 3.0]])
+LOWEST = np.array([5.0, -4.0, 20.0])
+JUMP = 1e6
+
+
+def model(*nuisance):
+    """One drive parameter, the timing, and an effect with some parameters."""
+    parameters = [SimpleNamespace(nuisance=x) for x in nuisance]
+    effect = SimpleNamespace(hypothesis=SimpleNamespace(parameters=parameters, options={}, effect="a law"))
+    return SimpleNamespace(par=SimpleNamespace(to_log=lambda: np.zeros(0)), effects=(effect,))
+
+
+def value(x):
+    return float((x - LOWEST) @ CURVATURE @ (x - LOWEST))
+
+
+@dataclass(frozen=True)
+class Bowl(Criterion):
+    """``value``, and a jump where the last coordinate grows."""
+
+    jumps: bool = False
+
+    def stepped(self, at, step, anew):
+        x = at.x + step
+        jump = JUMP if self.jumps and x[-1] > at.x[-1] else 0.0
+        return Point(at.model, x, [], [], value(x) + jump)
+
+    def cut(self, at, step):
+        return step
+
+
+def step_of(jumps, last_is_nuisance, monkeypatch, x=np.zeros(3)):
+    monkeypatch.setattr("ident.descent.is_slow", lambda model: False)
+    here = Point(model(False, last_is_nuisance), x, [], [], value(x))
+    bowl = Bowl(None, None, np.zeros(3), np.zeros(3), jumps=jumps)
+    return descend(bowl, here, CURVATURE, CURVATURE @ (LOWEST - x), 1e-9, False)
+
+
+def test_a_step_leads_to_the_lowest_point_of_a_paraboloid(monkeypatch):
+    step, damping = step_of(False, True, monkeypatch)
+    assert step.to.x == pytest.approx(LOWEST, rel=1e-6) and damping == 1e-9
+    assert step.gain == pytest.approx(step.foretold)
+
+
+def test_where_a_law_jumps_with_how_it_is_formed_the_others_step_on(monkeypatch):
+    """A fit had ended there, and what it had not found was another cause's."""
+    step, _ = step_of(True, True, monkeypatch)
+    among = np.linalg.solve(CURVATURE[:2, :2], (CURVATURE @ LOWEST)[:2])
+    assert step.to.x == pytest.approx([*among, 0.0], abs=1e-6)
+    assert 0.0 < step.gain == pytest.approx(step.foretold)
+
+
+def test_no_step_where_what_jumps_is_of_the_law_itself_or_nothing_is_gained(monkeypatch):
+    assert step_of(True, False, monkeypatch)[0] is None
+    assert step_of(True, True, monkeypatch, x=LOWEST)[0] is None
+
+
+def test_nuisances_are_parameters_of_effects():
+    assert nuisances(model(False, True)).tolist() == [False, False, True]
