@@ -494,7 +494,7 @@ def main(full: bool, arms: Collection[str]) -> None:
     print(f"commit {commit()}")
     cases = []
     if "twomass" in arms:
-        cases.append((make_case("twomass", load_robot("twomass"), starts, level=30.0, high=200.0), {}))
+        cases.append((make_case("twomass", load_robot("twomass"), starts, level=3.0, high=200.0), {}))
     if "pair" in arms:
         cases.append((make_case("two joints of the ur10", pair(), starts, level=1.0), {"chance": True}))
         equivalence(make_case("two joints of the ur10, a tenth of the excitation", pair(), 1, level=0.1))

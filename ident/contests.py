@@ -217,7 +217,9 @@ def narrower(problem: Problem, effect: Effect) -> list[Effect]:
     plain = next(
         x
         for x in catalogue(problem.structure, motions_alone=problem.motions_alone)
-        if x.key == h.key and "holds" not in x.options and x.options.get("turns") == h.options.get("turns")
+        if x.key == h.key
+        and "holds" not in x.options
+        and all(x.options.get(form) == h.options.get(form) for form in ("turns", "yields"))
     )
     return [Effect(plain, clip_to_bounds(plain, h.options["narrow"](effect.p)))]
 
@@ -236,11 +238,12 @@ def wider_laws(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis
 
 
 def forms_to_try(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:
-    """``wider_forms`` where the joint of a law has more than noise left, which no other joint answers for; none in
-    motions alone, below the modes of the links."""
-    if problem.motions_alone or h.joint < 0 or not unsettled_at(current, h.joint):
+    """``wider_forms`` where the joint of a law has more than noise left, which no other joint answers for; in motions
+    alone, below the modes of the links, of bundles and springs on the links only."""
+    if h.joint < 0 or not unsettled_at(current, h.joint):
         return []
-    return wider_forms(h)
+    forms = wider_forms(h, leads=not problem.motions_alone)
+    return [x for x in forms if x.effect == "dress_pack"] if problem.motions_alone else forms
 
 
 def nearly_settled(problem: Problem, current: Fit, h: Hypothesis) -> bool:

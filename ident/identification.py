@@ -340,6 +340,8 @@ def with_noise_of_fast_lines(dataset: Dataset, problem: Problem, result: Fit) ->
         return problem
     if not guessed and not (np.all(whole > LOUD) and whole.max() < ALIKE * whole.min()):
         return problem
+    # Of noise that falls off within the band the fast lines hold the least.
+    torque = torque * np.maximum(result.costs / (whole * result.counts), 1.0)
     return replace(problem, tau_std=problem.tau_std * np.sqrt(np.maximum(torque, 1.0)), noise_denied=not guessed)
 
 

@@ -36,6 +36,7 @@ DAMPING = 1e-3  # of the first step, in units of the diagonal
 LESS_DAMPING, LEAST_DAMPING = 10.0, 1e-9  # what the damping is divided by after a step, and its least
 SHORTER = 64.0  # factor on the damping of steps that are taken back (``descent.LOST``)
 LEAST_FALL = 0.02  # fall of the cost in a step below which the fit ends
+HARDLY_LESS = 0.5  # fall of the cost in a step, over that in the step before, from which its columns are made exactly
 CREEPING = 0.03  # share of the way to a cost aimed at, below which a step is the last
 # error, relative, of the fall of the cost that columns foretell, up to which they serve the next step too
 FORETOLD = 0.1
@@ -196,7 +197,7 @@ def fit(
     anew, moves, drift = needs_remainders(problem, model), moves_links(model), np.zeros(len(at.x))
     exact = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
     fine = converged = False  # fine: whether the steps are by exact derivatives already
-    damping, slow = DAMPING, is_slow(model)
+    damping, slow, last = DAMPING, is_slow(model), 0.0
     columns: list[Columns] = []
     for _ in range(iterations):
         fresh = not columns
@@ -215,6 +216,9 @@ def fit(
             continue
         if not (slow and abs(step.gain - step.foretold) <= max(FORETOLD * step.foretold, SLIGHT)):
             columns = []
+        if exact and not fine and HARDLY_LESS * last < step.gain < last:  # along a valley that these columns do not see
+            fine, columns = True, []
+        last = step.gain
         drift += np.abs(step.to.x - at.x)
         at, damping = step.to, max(damping / LESS_DAMPING, LEAST_DAMPING)
         if np.max(np.where(moves, drift, 0.0)) > STALE:

@@ -33,7 +33,7 @@ def drive_data(*effects, noise=0.1, trajectory=False, validation=1):
     options = {
         "points": 1,
         "validation_points": validation,
-        "levels": (20.0, 8.0),
+        "levels": (2.0, 0.8),
         "period": 1000,
         "trajectory": trajectory,
     }

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ident.chain import build_structure
-from ident.contests import best_of_each, narrower
+from ident.contests import best_of_each, forms_to_try, narrower
 from ident.diagnosis import diagnose
 from ident.evidence import Candidate
 from ident.hypotheses import catalogue, wider_forms
@@ -110,3 +110,20 @@ def test_an_encoder_out_of_centre_that_is_oval_too_is_one_cause(locked, tmp_path
     found = verdict.causes[0].parameters
     assert found["amplitude"].value == pytest.approx(0.02, rel=0.05)
     assert verdict.unexplained_verdict == "noise floor reached"
+
+
+@pytest.mark.parametrize(("motions", "yields"), [(True, False), (True, True), (False, True)])
+def test_a_bundle_at_rest_elsewhere_is_asked_for_in_motions_too(locked, monkeypatch, motions, yields):
+    """It is a static law of the link; laws of drives and encoders show above the modes of the links only."""
+    monkeypatch.setattr("ident.contests.unsettled_at", lambda fit, joint: True)
+    problem = SimpleNamespace(structure=build_structure(locked), motions_alone=motions)
+    laws = catalogue(problem.structure, motions_alone=motions)
+    bundle = next(h for h in laws if h.effect == "dress_pack" and h.options["yields"] == yields)
+    (hung,) = forms_to_try(problem, None, bundle)
+    own = [q.name for q in bundle.parameters]
+    assert [q.name for q in hung.parameters] == [*own, "rest_angle"]
+    p = np.array([2.0, 0.5, 0.01, 0.0])[: len(own)]
+    assert hung.options["widens"](p, None)[0].tolist() == [*p, 0.0]
+    assert hung.options["narrow"](np.array([*p, 0.3])).tolist() == p.tolist()
+    lag = next(h for h in laws if h.effect == "torque_lag")
+    assert bool(forms_to_try(problem, None, lag)) != motions

@@ -121,12 +121,15 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
     return tuple(out)
 
 
-def wider_forms(hypothesis: Hypothesis) -> list[Hypothesis]:
+def wider_forms(hypothesis: Hypothesis, leads: bool = True) -> list[Hypothesis]:
     """Laws with more parameters that hold another one, under its name or that of a law next to it; none of others.
 
     Of a lag or a delay the lag of second order; of an encoder out of centre the one that is oval too; of a balancing
     spring the one between two points; of that and of a bundle of cables the bundle with another rest; of a bristle the
     slips in parallel.
+
+    Args:
+        leads: as of ``link_springs.dress_pack``.
     """
     h = hypothesis
     if "holds" in h.options:
@@ -137,9 +140,9 @@ def wider_forms(hypothesis: Hypothesis) -> list[Hypothesis]:
         return [slips.slipping_friction(h.joint, h.place)]
     if h.effect == "gravity_spring":
         between = [] if h.options["linear"] else [link_springs.spring_between_points(h.joint, h.place)]
-        return [*between, link_springs.hung_dress_pack(h.joint, h.place, spring=True)]
+        return [*between, link_springs.hung_dress_pack(h.joint, h.place, spring=True, leads=leads)]
     if h.effect == "dress_pack":
-        return [] if h.options["yields"] else [link_springs.hung_dress_pack(h.joint, h.place, spring=False)]
+        return [link_springs.hung_dress_pack(h.joint, h.place, False, yields=h.options["yields"], leads=leads)]
     lags = [make(h.joint, h.place, second=True) for make in (drive.torque_lag, sensing.sensor_lag)]
     return [x for x in lags if h.effect in (x.effect, x.options["holds"])]
 

@@ -168,18 +168,21 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False,
     )
 
 
-def hung_dress_pack(joint: int, place: str, spring: bool) -> Hypothesis:
+def hung_dress_pack(joint: int, place: str, spring: bool, yields: bool = False, leads: bool = True) -> Hypothesis:
     """A ``dress_pack`` that is at rest at another angle than zero.
 
     Args:
         spring: whether it is begun from a balancing spring; else from a bundle.
+        yields, leads: as of ``dress_pack``.
     """
+    plain = dress_pack(joint, place, leads=leads, yields=yields, hung=True)
+    kept = len(plain.parameters) - 1  # of a bundle that is not
 
     def widens(p: np.ndarray, scale: SignalScale) -> list[np.ndarray]:
         if not spring:
-            return [np.array([*p, *(0.0 for _ in range(4 - len(p))), 0.0])]
-        return [np.array([p[0], share * p[0] * scale.q, TURNS * scale.v, 0.0, p[1]]) for share in RUBS]
+            return [np.array([*p, *(0.0 for _ in range(kept - len(p))), 0.0])]
+        turn = (TURNS * scale.v, 0.0)[: kept - 2]
+        return [np.array([p[0], share * p[0] * scale.q, *turn, p[1]]) for share in RUBS]
 
-    plain = dress_pack(joint, place, hung=True)
-    own = {"holds": "gravity_spring" if spring else "dress_pack", "widens": widens, "narrow": lambda p: p[:4]}
+    own = {"holds": "gravity_spring" if spring else "dress_pack", "widens": widens, "narrow": lambda p: p[:kept]}
     return replace(plain, screen=None, options=plain.options | own)
