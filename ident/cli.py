@@ -27,19 +27,19 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, help="Find what a 
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
 Out = Annotated[Path, typer.Option("--out", help="Where to write.")]
+INTERRUPTED = 130  # exit status, as of a command that SIGINT ended
 FRF_ESTIMATORS = "auto, h1, jio, ari, har, log; lpm or lrm for fewer experiments than inputs."
 
 
 def main() -> None:
-    """Run; bad input ends in one line on stderr and exit status 2."""
+    """Run; bad input ends in one line on stderr and exit status 2, an interrupt in one and 130."""
     try:
-        app(standalone_mode=False)
+        # Without its own mode typer returns the status of what ends early; an interrupt has become such an end.
+        status = app(standalone_mode=False)
     except DataError as err:
         sys.exit(_fail(str(err)))
-    except typer.Exit as err:
-        sys.exit(err.exit_code)
     except (typer.Abort, KeyboardInterrupt):
-        sys.exit(_fail("interrupted"))
+        sys.exit(_fail("interrupted", INTERRUPTED))
     except Exception as err:
         if isinstance(err, OSError) and err.errno == errno.ENAMETOOLONG:  # of whatever path the command was given
             sys.exit(_fail(f"path: {err.filename}: found a name that is too long, expected one that a file can have"))
@@ -48,11 +48,15 @@ def main() -> None:
         if type(err).__module__.startswith(("click", "typer")):
             sys.exit(_fail(err.format_message() if hasattr(err, "format_message") else str(err)))
         raise
+    if status == INTERRUPTED:
+        _fail("interrupted")
+    if status:
+        sys.exit(status)
 
 
-def _fail(text: str) -> int:
+def _fail(text: str, status: int = 2) -> int:
     print("simgap: " + " ".join(text.split()), file=sys.stderr)
-    return 2
+    return status
 
 
 @contextmanager

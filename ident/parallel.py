@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -160,7 +161,11 @@ def open_executor(text: str) -> Iterator[Executor | None]:
         workers = int(rest) if rest else os.cpu_count() or 1
         # A fork would copy the locks of threads that run now.
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_share_cores) as pool:
-            yield pool
+            try:
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)  # nobody takes what else was handed out
+                raise
     elif kind == "dask" and rest.startswith("//") and rest[2:]:
         with _dask(rest[2:]) as executor:
             yield executor
@@ -170,6 +175,7 @@ def open_executor(text: str) -> Iterator[Executor | None]:
 
 def _share_cores() -> None:
     os.environ[THREADS_VARIABLE] = "1"
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt from the keyboard reaches all: one of them tells of it
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The command line as a user calls it."""
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -216,3 +217,31 @@ def test_a_plan_that_cannot_be_written_is_refused_before_it_is_made(tmp_path, mo
 def test_no_command_is_one_line_beside_the_help():
     run = simgap()
     assert run.returncode == 2 and "no command" in run.stderr and "experiment" in run.stdout
+
+
+@pytest.mark.parametrize("command", ["experiment", "diagnose"])
+def test_an_interrupted_command_ends_with_status_130_in_one_line_and_writes_nothing(dataset, tmp_path, command):
+    args = {"experiment": ("twomass", "--realizations", 300), "diagnose": (dataset,)}[command]
+    run = subprocess.Popen(
+        [sys.executable, "-m", "ident.cli", command, *map(str, args), "--out", str(tmp_path / "out")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert run.stderr.readline()  # of its progress: it is at work
+    run.send_signal(signal.SIGINT)
+    out, err = run.communicate(timeout=120)
+    assert run.returncode == 130 and not out
+    assert err.splitlines()[-1] == "simgap: interrupted" and "Traceback" not in err
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_status_of_the_viewer_is_that_of_show(tmp_path, monkeypatch):
+    from ident import cli
+
+    monkeypatch.setattr("ident.show.recording.check_recording", lambda path: None)
+    monkeypatch.setattr(subprocess, "call", lambda args: 3)
+    monkeypatch.setattr(sys, "argv", ["simgap", "show", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 3
