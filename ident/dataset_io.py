@@ -15,6 +15,18 @@ import pyarrow.parquet as pq
 import tomlkit
 
 from ident.dataset import CHANNELS, Dataset, Filled, Segment
+from ident.format_checks import (
+    HOLDS,
+    KINDS,
+    MAX_SEGMENTS,
+    ROLES,
+    amplitude,
+    check_count,
+    check_lines,
+    checked,
+    periods_of,
+    sample_rate,
+)
 from ident.outputs import take_place
 from ident.segment_file import read_segment
 from robot_assets.errors import DataError
@@ -22,10 +34,6 @@ from robot_assets.robot import Robot, load_robot, robot_reference
 from robot_assets.values import choice, exists, number, read_toml, show, subtable, tables, text, vector, whole
 
 FORMAT = "simgap-dataset/1"
-KINDS = ("multisine", "trajectory")
-ROLES = ("identification", "validation")
-HOLDS = ("zoh", "none")
-MAX_SEGMENTS = 100_000
 LONGEST_NAME = 240  # bytes of the name of a file
 
 
@@ -42,7 +50,7 @@ def load_dataset(path: str | Path) -> Dataset:
     folder, where = toml.parent, str(toml)
     head = read_toml(toml, "dataset.toml")
     choice(head, "format", where, (FORMAT,))
-    rate = number(head, "sample_rate", where, low=1e-3, high=1e7)
+    rate = sample_rate(head, where)
     joints = head.get("joints")
     if not isinstance(joints, list) or not joints or not all(isinstance(j, str) for j in joints):
         raise DataError("joints", where, show(joints), "a list of joint names")
@@ -53,8 +61,7 @@ def load_dataset(path: str | Path) -> Dataset:
     noise = subtable(head, "noise", where)
     levels = {key: _std(noise, key, len(joints), where) for key in ("q_std", "tau_std")}
     entries = tables(head, "segment", where)
-    if not 0 < len(entries) <= MAX_SEGMENTS:
-        raise DataError("[[segment]]", where, f"{len(entries)} entries", f"1 to {MAX_SEGMENTS}")
+    check_count(len(entries), where)
     seen: dict[str, str] = {}
     names: set[str] = set()
     segments = tuple(_segment(e, i, folder, where, len(joints), rate, seen, names) for i, e in enumerate(entries))
@@ -112,8 +119,10 @@ def save_dataset(dataset: Dataset, path: str | Path) -> None:
     """Write a dataset folder: beside the target first, then moved into place.
 
     Raises:
-        DataError: where the target exists and holds anything that is no part of a dataset.
+        DataError: where the target exists and holds anything that is no part of a dataset, or the dataset breaks the
+            format.
     """
+    dataset = checked(dataset)
     target = check_target(path)
     for segment in dataset.segments:
         check_segment_name(segment.name, str(path))
@@ -217,31 +226,15 @@ def _segment(
         t=t,
         q0=None if "q0" not in entry else vector(entry["q0"], "q0", where, n, f"{n} finite numbers, one per joint"),
         operating_point=None if "operating_point" not in entry else text(entry, "operating_point", where),
-        amplitude=number(entry, "amplitude", where, low=1e-9, high=1e9, default=1.0),
+        amplitude=amplitude(entry, where),
         filled=_filled(entry, where),
         **channels,
     )
     if kind == "trajectory":
         return Segment(**common)
-    text(entry, "operating_point", where)
-    period = whole(entry, "period", where, low=4)
-    periods = whole(entry, "periods", where, low=1)
-    transient = whole(entry, "transient_periods", where, low=0, default=0)
-    if transient >= periods:
-        raise DataError("transient_periods", where, str(transient), f"less than periods = {periods}")
-    if len(t) != period * periods:
-        raise DataError(
-            "samples", str(path), f"{len(t)}", f"period * periods = {period} * {periods} = {period * periods}"
-        )
-    return Segment(
-        **common,
-        period=period,
-        periods=periods,
-        transient_periods=transient,
-        experiment=whole(entry, "experiment", where, low=1, default=None),
-        realization=whole(entry, "realization", where, low=1, default=None),
-        excited_lines=_lines(entry.get("excited_lines", []), period, where),
-    )
+    repeats = periods_of(entry, len(t), where, str(path))
+    lines = _lines(entry.get("excited_lines", []), repeats["period"], where)
+    return Segment(**common, **repeats, excited_lines=lines)
 
 
 def _refuse_copies(segments: tuple[Segment, ...], files: list[str], where: str) -> None:
@@ -287,9 +280,7 @@ def _inside(folder: Path, file: str, where: str) -> Path:
 def _lines(lines: Any, period: int, where: str) -> np.ndarray:
     if not isinstance(lines, list) or not all(isinstance(k, int) and not isinstance(k, bool) for k in lines):
         raise DataError("excited_lines", where, show(lines), "a list of whole numbers")
-    for k in lines:
-        if not 1 <= k < period / 2:
-            raise DataError("excited_lines", where, f"line {show(k)}", f"lines from 1 to below Nyquist, {period / 2:g}")
+    check_lines(lines, period, where)
     return np.unique(np.asarray(lines, int))
 
 

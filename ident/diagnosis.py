@@ -13,6 +13,7 @@ from ident.attribute import Attribution
 from ident.conclude import Findings, conclude
 from ident.dataset import Dataset
 from ident.extended import Prediction
+from ident.format_checks import check_limits, checked
 from ident.group import Group
 from ident.held_out import not_fitted, with_held_out
 from ident.identification import identify
@@ -70,7 +71,12 @@ def diagnose_fully(
         progress: told in a line what is done.
         executor: of ``concurrent.futures``, for the fits of candidates; threads, one per core, where
             None. Results are the same.
+
+    Raises:
+        DataError: where the dataset breaks the format, a limit is none, or as of ``identify``.
     """
+    dataset = checked(dataset)
+    check_limits(max_causes, max_seconds)
     began = time.perf_counter()
     workers = Workers(executor, progress, time.monotonic() + max_seconds)
     say = workers.say

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.dataset import Dataset, Segment
+from ident.format_checks import checked
 from ident.frf_basis import (
     FRF,
     SMOOTH,
@@ -59,11 +60,12 @@ def estimate_frf(
         amplitude: level; of each point its highest where None.
 
     Raises:
-        DataError: where nothing was recorded at that level, a point has fewer than n experiments or
+        DataError: where the dataset breaks the format, nothing was recorded at that level, a point has fewer than n experiments or
             experiments that do not excite every input, or JIO has no reference.
     """
     if estimator not in ESTIMATORS + LOCAL:
         raise DataError("estimator", "estimate_frf", repr(estimator), f"one of {ESTIMATORS + LOCAL}")
+    dataset = checked(dataset)
     if estimator in LOCAL:
         return estimate_local(dataset, method=estimator, role=role, amplitude=amplitude)
     points, level = choose_segments(dataset, role, amplitude)

@@ -12,6 +12,7 @@ from ident.chain import Structure, build_structure
 from ident.channel_checks import MOVES
 from ident.dataset import Dataset
 from ident.extended import Prediction
+from ident.format_checks import checked
 from ident.graybox import Parameters, equilibrium, linearise, stiffness_diagonal
 from ident.group import Group
 from ident.inverse import Sampling
@@ -145,7 +146,12 @@ def motion_band_hz(dataset: Dataset, structure: Structure, nominal: Parameters) 
 
 @one_thread_each
 def identify(dataset: Dataset, *, progress: Callable[[str], None] | None = None) -> tuple[Setup, Fit]:
-    """Baseline parameters by maximum likelihood on the torque residual."""
+    """Baseline parameters by maximum likelihood on the torque residual.
+
+    Raises:
+        DataError: where the dataset breaks the format, or its motions cannot be those of the robot; as of ``set_up``.
+    """
+    dataset = checked(dataset)
     setup = set_up(dataset)
     try:
         setup, result = in_shown_steps(dataset, *first_model(dataset, setup, progress), progress)

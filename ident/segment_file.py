@@ -10,14 +10,11 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 from ident.dataset import CHANNELS
+from ident.format_checks import REQUIRED, check_column, check_time
 from ident.unpacked import check_size
 from robot_assets.errors import DataError
 from robot_assets.values import exists
 
-REQUIRED = ("tau", "q")
-TIME_TOLERANCE = 0.05  # of a sample period, on every step of `t`
-LARGEST = 1e12  # SI; anything above is no angle, torque or time
-SHORTEST = 16  # samples
 LONGEST = 100_000_000  # samples; more is no recording but a broken or hostile header
 
 
@@ -35,9 +32,7 @@ def read_segment(path: Path, where: str, n: int, rate: float) -> tuple[np.ndarra
     """
     columns = _columns(path, where)
     t = _column(columns, "t", path)
-    if len(t) < SHORTEST:
-        raise DataError("column t", str(path), f"{len(t)} samples", f"at least {SHORTEST}")
-    _check_time(t, rate, path)
+    check_time(t, rate, "column t", str(path))
     return t, {channel: _channel(columns, channel, n, path) for channel in CHANNELS}
 
 
@@ -87,15 +82,7 @@ def _column(columns: dict[str, np.ndarray], name: str, path: Path) -> np.ndarray
     if name not in columns:
         raise DataError(f"column {name}", str(path), "no such column", "a required column")
     x = columns[name]
-    bad = np.flatnonzero(~np.isfinite(x))
-    if len(bad):
-        kind = "NaN" if np.isnan(x[bad[0]]) else "infinity"
-        raise DataError(
-            f"column {name}", str(path), f"{kind} at sample {bad[0]} ({len(bad)} not finite in all)", "finite numbers"
-        )
-    if len(x) and np.abs(x).max() > LARGEST:
-        k = int(np.argmax(np.abs(x)))
-        raise DataError(f"column {name}", str(path), f"{x[k]:.3g} at sample {k}", f"at most {LARGEST:g} in SI units")
+    check_column(x, f"column {name}", str(path))
     return x
 
 
@@ -118,27 +105,3 @@ def _channel(columns: dict[str, np.ndarray], channel: str, n: int, path: Path) -
         if name in own:
             out[:, j] = _column(columns, name, path)
     return out
-
-
-def _check_time(t: np.ndarray, rate: float, path: Path) -> None:
-    step = np.diff(t)
-    bad = np.flatnonzero(np.abs(step * rate - 1.0) > TIME_TOLERANCE)
-    if len(bad) > 0.5 * len(step):
-        middle = float(np.median(step))
-        found = f"a rate of {1 / middle:.6g} Hz" if middle else "a time that stands still"
-        raise DataError("column t", str(path), found, f"sample_rate = {rate:g} Hz")
-    if len(bad):
-        k = int(bad[0])
-        raise DataError(
-            "column t",
-            str(path),
-            f"a step of {step[k]:.6g} s at sample {k} ({len(bad)} such)",
-            f"uniform steps of {1 / rate:.6g} s",
-        )
-    if abs((t[-1] - t[0]) * rate / (len(t) - 1) - 1.0) > 1e-3:
-        raise DataError(
-            "column t",
-            str(path),
-            f"a mean rate of {(len(t) - 1) / (t[-1] - t[0]):.6g} Hz",
-            f"sample_rate = {rate:g} Hz",
-        )

@@ -9,8 +9,10 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 import pytest
 
+import ident
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
+from ident.format_checks import checked
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 
@@ -196,7 +198,7 @@ def test_saving_leaves_a_foreign_folder_alone(folder, tmp_path):
 
 def test_a_failing_save_harms_no_earlier_dataset(folder):
     path, data = folder
-    broken = replace(data, segments=(replace(data.segments[0], tau=np.array([["x"]])),))
+    broken = replace(data, controller={"gain": object()})  # known when it is written
     with pytest.raises(ValueError):
         save_dataset(broken, path)
     assert len(load_dataset(path).segments) == 2
@@ -228,3 +230,108 @@ def test_a_robot_of_the_users_own_is_found_from_the_dataset_wherever_both_are(fo
     shutil.move(tmp_path / "lab", tmp_path / "elsewhere")
     there = tmp_path / "elsewhere"
     assert load_dataset(there / "run" / "d").robot.folder == (there / "arms" / "mine").resolve()
+
+
+def varied(data, i=0, **changes):
+    """A dataset of which one segment is another."""
+    segments = list(data.segments)
+    segments[i] = replace(segments[i], **changes)
+    return replace(data, segments=tuple(segments))
+
+
+def with_nan(x):
+    x = x.copy()
+    x[50, 1] = np.nan
+    return x
+
+
+BREACHES = {
+    "nan": (lambda d, s: varied(d, tau=with_nan(s.tau)), "tau of joint 2: .* segment a: found NaN at sample 50"),
+    "infinite": (lambda d, s: varied(d, q=np.full_like(s.q, np.inf)), "q of joint 1: .*infinity at sample 0"),
+    "huge": (lambda d, s: varied(d, q=1e13 * s.q), "q of joint 1: .*at most 1e"),
+    "transposed": (lambda d, s: varied(d, tau=s.tau.T), r"tau: .*shape \(6, 200\), expected \(200, 6\)"),
+    "one-dimensional": (lambda d, s: varied(d, q=s.q[:, 0]), r"q: .*shape \(200,\)"),
+    "short": (lambda d, s: varied(d, r=s.r[:-10]), r"r: .*shape \(190, 6\), expected \(200, 6\)"),
+    "a joint less": (lambda d, s: varied(d, q=s.q[:, 1:]), r"q: .*shape \(200, 5\)"),
+    "list": (lambda d, s: varied(d, tau=s.tau.tolist()), "tau: .*found a list, expected an array of numbers"),
+    "objects": (lambda d, s: varied(d, tau=s.tau.astype(object)), "tau: .*an array of object, expected real"),
+    "complex": (lambda d, s: varied(d, tau=s.tau + 0j), "tau: .*complex128"),
+    "masked": (lambda d, s: varied(d, tau=np.ma.masked_array(s.tau)), "tau: .*MaskedArray"),
+    "none": (lambda d, s: varied(d, q=None), "q: .*NoneType"),
+    "kind": (lambda d, s: varied(d, kind="multi"), 'kind: .*\'multi\', expected "multisine" or "trajectory"'),
+    "role": (lambda d, s: varied(d, role="train"), "role: .*'train'"),
+    "no period": (lambda d, s: varied(d, period=None), "period: .*no such key"),
+    "other period": (lambda d, s: varied(d, period=99), r"samples: .*200, expected period \* periods = 99 \* 2"),
+    "no steady one": (lambda d, s: varied(d, transient_periods=2), "transient_periods: .*less than periods = 2"),
+    "lines": (lambda d, s: varied(d, excited_lines=np.array([3, 50])), "excited_lines: .*line 50, .*below Nyquist, 50"),
+    "lines no numbers": (lambda d, s: varied(d, excited_lines=["3"]), "excited_lines: .*an array"),
+    "broken lines": (lambda d, s: varied(d, excited_lines=np.array([3.5])), "excited_lines: .*an array"),
+    "amplitude": (lambda d, s: varied(d, amplitude=np.nan), "amplitude: .*nan"),
+    "posture": (lambda d, s: varied(d, q0=np.zeros(5)), r"q0: .*shape \(5,\), expected \(6,\)"),
+    "name": (lambda d, s: varied(d, name="b"), "name: .*segment b: found it a second time"),
+    "rate": (lambda d, s: replace(d, sample_rate=0.0), "sample_rate: dataset d: found 0.0"),
+    "other rate": (lambda d, s: replace(d, sample_rate=500.0), "t: .*a rate of 1000 Hz"),
+    "hold": (lambda d, s: replace(d, input_hold="foh"), "input_hold: .*'foh'"),
+    "noise": (lambda d, s: replace(d, q_std=-d.q_std), "q_std: .*at least zero"),
+    "joints": (lambda d, s: replace(d, joints=d.joints[::-1]), "joints: .*expected those of the robot"),
+    "nothing": (lambda d, s: replace(d, segments=()), "segment.*: found 0 entries"),
+    "no dataset": (lambda d, s: "d", "dataset: argument: found a str"),
+}
+
+
+@pytest.mark.parametrize("breach", BREACHES)
+def test_a_dataset_made_in_memory_that_breaks_the_format_is_one_clear_error(folder, tmp_path, breach):
+    made, message = BREACHES[breach]
+    data = replace(folder[1], name="d")
+    with pytest.raises(DataError, match=message):
+        save_dataset(made(data, data.segments[0]), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("entrance", ["estimate_frf", "identify", "diagnose", "diagnose_fully"])
+def test_every_entrance_refuses_what_breaks_the_format(folder, entrance):
+    data = folder[1]
+    with pytest.raises(DataError, match=r"tau of joint 2: .*NaN at sample 50"):
+        getattr(ident, entrance)(varied(data, tau=with_nan(data.segments[0].tau)))
+
+
+@pytest.mark.parametrize(
+    "limit", [{"max_causes": -1}, {"max_causes": 1.5}, {"max_seconds": np.nan}, {"max_seconds": -1}]
+)
+def test_limits_of_a_search_are_refused_as_the_command_line_does(folder, limit):
+    with pytest.raises(DataError, match=f"{next(iter(limit))}: diagnose: found"):
+        ident.diagnose(folder[1], **limit)
+
+
+def test_arrays_of_other_numbers_and_orders_are_a_dataset_as_good(folder, tmp_path):
+    data = folder[1]
+    assert checked(data) is data
+    s = data.segments[0]
+    q = np.asfortranarray(s.q)
+    q.flags.writeable = False
+    link = s.q.copy()
+    link[:, 2] = np.nan  # a joint without a link encoder
+    other = varied(
+        data,
+        tau=np.round(s.tau).astype(int),
+        q=q,
+        r=s.r.astype(np.float32),
+        q_link=link,
+        period=np.int64(s.period),
+        amplitude=np.float32(0.5),
+        excited_lines=list(np.array([5, 3, 3], np.int32)),
+    )
+    found = checked(replace(other, sample_rate=np.int64(1000))).segments[0]
+    assert found.q is q and found.q_link is link
+    assert found.tau.dtype == found.r.dtype == float and found.excited_lines.tolist() == [3, 5]
+    save_dataset(other, tmp_path / "other")
+    assert np.array_equal(load_dataset(tmp_path / "other").segments[0].tau, np.round(s.tau))
+
+
+def test_a_dataset_of_other_numbers_has_the_same_frf(clean):
+    def single(s):
+        return replace(s, tau=s.tau.astype(np.float32), q=np.asfortranarray(s.q), excited_lines=s.excited_lines[::-1])
+
+    data = clean[0]
+    single_ones = replace(data, segments=tuple(map(single, data.segments)))
+    np.testing.assert_allclose(ident.estimate_frf(single_ones).G, ident.estimate_frf(data).G, rtol=1e-4)

@@ -26,7 +26,7 @@ from ident.convert.mapping import Column, LogMap, read_map
 from ident.convert.reading import read_log
 from ident.dataset import Dataset, Filled, Segment
 from ident.dataset_io import check_segment_name
-from ident.segment_file import LARGEST, SHORTEST
+from ident.format_checks import LARGEST, SHORTEST
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, linear_joints, load_robot
 

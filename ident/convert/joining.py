@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
 from ident.convert.mapping import LogMap
-from ident.segment_file import SHORTEST
+from ident.format_checks import SHORTEST
 from robot_assets.errors import DataError
 
 

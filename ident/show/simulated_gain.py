@@ -10,6 +10,7 @@ import numpy as np
 
 from ident.dataset import Dataset
 from ident.extended import predict
+from ident.format_checks import checked
 from ident.gain import Errors, mean_squares, measure_gain
 from ident.graybox import parameter_names
 from ident.group import Group
@@ -56,9 +57,9 @@ def simulated_gain(
         The gain, None where no held-out segment can be followed.
 
     Raises:
-        DataError: where the dataset has no held-out segments.
+        DataError: where the dataset breaks the format or has no held-out segments.
     """
-    dataset = with_held_out(with_lost_samples_filled(dataset)[0])
+    dataset = with_held_out(with_lost_samples_filled(checked(dataset))[0])
     setup, baseline = identify(dataset, progress=progress)
     if not setup.held_out:
         raise DataError("segments", dataset.name, "none of role validation", "at least one to simulate")
