@@ -89,6 +89,7 @@ class Findings:
         belied: causes, by ``key``, that held-out data deny (``trust.denied``).
         tones: what does not repeat with the period; lost: samples that were. Where nothing else is found these are an
             unknown cause.
+        unsought: as of ``notes.sentence``.
     """
 
     dataset: Dataset
@@ -105,6 +106,7 @@ class Findings:
     belied: Collection[tuple[str, str]] = ()
     tones: Sequence[Tone] = ()
     lost: Sequence[LostSamples] = ()
+    unsought: str = ""
 
     @property
     def final(self) -> Fit:
@@ -153,7 +155,7 @@ def conclude(found: Findings) -> Verdict:
         unexplained_verdict=UNKNOWN if unknown else "noise floor reached",
         gain=found.gain,
         next_experiment=next_step(found, causes, unknown, alone),
-        sentence=sentence(causes, unknown, detected, found.gain),
+        sentence=sentence(causes, unknown, detected, found.gain, "" if alone else found.unsought),
         unidentified=undetermined,
         notes=tuple(notes_on(found, causes, tones, detected)),
     )
@@ -170,6 +172,8 @@ def next_step(found: Findings, causes: Sequence[Cause], unknown: bool, alone: bo
         return (
             f"Mend what loses samples of {' and '.join(lost)}, and record again: with these filled nothing else shows."
         )
+    if found.unsought and not alone:
+        return None
     return found.separating.text if found.separating else advice(causes, unknown, found.dataset.n)
 
 

@@ -21,7 +21,7 @@ from ident.leftover import find_leftover
 from ident.link_sensor import find_link_delays
 from ident.lost_samples import with_lost_samples_filled
 from ident.next_experiment import separating_experiment
-from ident.notes import chosen_motion_note, nameless_law
+from ident.notes import NOT_SOUGHT, TIME_UP, chosen_motion_note, nameless_law, time_note
 from ident.parallel import Workers, one_thread_each
 from ident.period_checks import unrepeated
 from ident.problem import predictions
@@ -86,7 +86,9 @@ def diagnose_fully(
     if doubts:
         say("the recording looks mislabelled: no causes are sought")
         max_causes = 0
-    sought = seek(dataset, *identify(dataset, progress=say), max_causes, workers, mislabelled=bool(doubts))
+    setup, baseline = identify(dataset, progress=say)
+    begins = max_causes > 0 and not workers.late
+    sought = seek(dataset, setup, baseline, max_causes, workers, mislabelled=bool(doubts))
     setup, problem, baseline = sought.setup, sought.setup.problem, sought.baseline
     first = predictions(problem, baseline.model, baseline.remainders)
     say("gain on held-out data")
@@ -115,6 +117,7 @@ def diagnose_fully(
             belied=belied.intersection(r.candidates[0].hypothesis.key for r in result.rounds),
             tones=tones_of(sought.recorded, last),
             lost=lost,
+            unsought=unsought(sought, begins),
         )
     )
     left = None
@@ -123,7 +126,7 @@ def diagnose_fully(
         told = (left.text if left else "") + nameless_law(result, problem.structure)
         verdict = replace(verdict, residual_description=told.strip())
     if sought.late:
-        notes.append(f"The {max_seconds:g} s for the search for causes are used up: with more time more may be found.")
+        notes.append(time_note(max_seconds, bool(verdict.causes) and verdict.unexplained_verdict != UNKNOWN))
     notes += (f"Not used: {line}." for line in not_fitted(given))
     if guessed := guessed_drives(dataset.robot):
         notes.append(f"The drives of {', '.join(guessed)} were fitted from guesses: robot.toml does not know them.")
@@ -172,6 +175,18 @@ def tested(
     if test.told_by_torque:
         notes.append(chosen_motion_note(test.told_by_torque))
     return result, test, notes
+
+
+def unsought(sought: Sought, begins: bool) -> str:
+    """Why it cannot be said that nothing explains what is left: causes of it were not sought, or not to the end; empty
+    where it can.
+
+    Args:
+        begins: whether there was time for a search.
+    """
+    if sought.result.rounds:
+        return ""
+    return TIME_UP if begins and sought.late else "" if begins else NOT_SOUGHT
 
 
 def tones_of(recorded: Sequence[Group], found: Sequence[Prediction]) -> tuple[Tone, ...]:

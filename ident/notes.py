@@ -24,18 +24,31 @@ from ident.verdict import Alternative, Cause, Gain
 
 FAR_OFF = 1.5  # error of held-out data over their noise, from which it is told
 ALONG = 0.8  # error of held-out data along the record over that of a simulation, below which both are told
+NAMED = 0.5  # probability above which a cause is taken as named
+TIE = 0.5  # of the probability of a cause, above which a rival ties with it
+NOT_SOUGHT = "no cause was searched for"
+TIME_UP = "the time for the search was used up before a cause was found"
 RIVAL = 0.1  # of the probability of a cause, above which the sentence tells a rival too
 
 
-def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain | None) -> str:
-    """The verdict in one sentence."""
+def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain | None, unsought: str = "") -> str:
+    """The verdict in one sentence.
+
+    Args:
+        unknown: whether something is left that no cause accounts for.
+        unsought: why nothing can be said of that (``NOT_SOUGHT``, ``TIME_UP``); empty where causes of it were sought.
+    """
     if not detected:
         return "The simulation agrees with the data: nothing beyond noise was found."
-    sure = [c for c in causes if c.probability > 0.5]
-    open_ones = [] if unknown else [c for c in causes if c.probability <= 0.5]
+    sure = [c for c in causes if is_sure(c)]
+    open_ones = [c for c in causes if not is_sure(c) and (c.probability > NAMED or not unknown)]
     possible = "; ".join(" or ".join(_said(x.effect, x.joint, x.probability) for x in likely(c)) for c in open_ones)
+    left = f"something remains: {unsought}" if unsought else "an unknown cause remains"
+    rest = f", and {left}" if unknown else ""
     if not sure and possible:
-        return f"The simulation misses something that these data do not tell for sure: {possible}."
+        return f"The simulation misses something that these data do not tell for sure: {possible}{rest}."
+    if not sure and unsought:
+        return f"The simulation misses something, and {unsought}."
     if not sure:
         return "The simulation misses something that no effect of the catalogue explains: an unknown cause remains."
     *others, last = [_said(c.effect, c.joint, c.probability) for c in sure]
@@ -46,8 +59,13 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
         if gain is None or gain.gap_closed is None or not of_torque
         else f"; naming {'them' if others else 'it'} closes {min(gain.gap_closed, 1.0):.1%} of the gap to the noise on held-out data"
     )
-    rest = ", and an unknown cause remains" if unknown else f"; not for sure {possible}" if possible else ""
-    return f"The simulation misses {names}{closed}{rest}."
+    return f"The simulation misses {names}{closed}{f'; not for sure {possible}' if possible else ''}{rest}."
+
+
+def is_sure(cause: Cause) -> bool:
+    """Whether the sentence names a cause as found: it is likelier than not, and no rival comes close."""
+    rival = max((a.probability for a in cause.alternatives), default=0.0)
+    return cause.probability > NAMED and rival <= TIE * cause.probability
 
 
 def likely(cause: Cause) -> list[Cause | Alternative]:
@@ -216,6 +234,16 @@ def tone_note(tone: Tone, joint: str) -> str:
         f"At {joint} the torque holds a tone near {tone.frequency_hz:.4g} Hz that does not repeat with the period of the excitation,"
         f" {tone.ratio:.3g} times the power of the noise there: something else shakes it, and counts as noise here."
     )
+
+
+def time_note(seconds: float, nothing_left: bool) -> str:
+    """A search that ended for want of time.
+
+    Args:
+        nothing_left: whether what was found leaves noise alone.
+    """
+    more = "; what was found leaves no more than noise" if nothing_left else ": with more time more may be found"
+    return f"The {seconds:g} s for the search for causes are used up{more}."
 
 
 def lost_note(lost: LostSamples, joint: str) -> str:

@@ -829,6 +829,24 @@ def test_the_noise_of_one_joint_leaves_no_doubt_about_a_faint_cause():
             False,
             "The simulation misses cogging at a (99%); not for sure backlash at a (40%) or torque lag at b (30%).",
         ),
+        (
+            [("backlash", 0.50007, 0.49993)],
+            False,
+            "The simulation misses something that these data do not tell for sure: backlash at a (50%) or torque lag at b (50%).",
+        ),
+        ([("backlash", 0.66, 0.32)], False, "The simulation misses backlash at a (66%)."),
+        (
+            [("backlash", 0.6, 0.35)],
+            True,
+            "The simulation misses something that these data do not tell for sure: backlash at a (60%) or torque lag at b (35%),"
+            " and an unknown cause remains.",
+        ),
+        (
+            [("cogging", 0.99, 0.0), ("backlash", 0.55, 0.45)],
+            True,
+            "The simulation misses cogging at a (99%); not for sure backlash at a (55%) or torque lag at b (45%), and an unknown"
+            " cause remains.",
+        ),
     ],
 )
 def test_the_sentence_tells_what_is_sure_what_is_not_and_what_nothing_explains(causes, unknown, told):
@@ -837,6 +855,29 @@ def test_the_sentence_tells_what_is_sure_what_is_not_and_what_nothing_explains(c
 
     found = [Cause(e, "a", {}, p, "", (Alternative("torque_lag", "b", rival),)) for e, p, rival in causes]
     assert sentence(found, unknown, True, None) == told
+
+
+def test_the_sentence_claims_nothing_of_causes_that_were_not_sought():
+    from ident.notes import NOT_SOUGHT, TIME_UP, sentence
+    from ident.verdict import Cause
+
+    assert sentence([], True, True, None, NOT_SOUGHT) == (
+        "The simulation misses something, and no cause was searched for."
+    )
+    assert sentence([], True, True, None, TIME_UP).endswith(
+        "and the time for the search was used up before a cause was found."
+    )
+    steps = Cause("encoder_quantization", "a", {}, 0.99, "", ())
+    assert sentence([steps], True, True, None, NOT_SOUGHT).endswith(
+        "encoder quantization at a (99%), and something remains: no cause was searched for."
+    )
+
+
+@pytest.mark.parametrize("nothing_left", [True, False])
+def test_more_time_is_advised_where_something_is_left_to_be_found(nothing_left):
+    from ident.notes import time_note
+
+    assert ("more may be found" in time_note(150.0, nothing_left)) is not nothing_left
 
 
 @pytest.mark.parametrize(

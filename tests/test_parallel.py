@@ -6,16 +6,18 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from inspect import signature
 from multiprocessing import get_context
+from types import SimpleNamespace
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from ident.dataset import Dataset
 from ident.design import design_experiment
-from ident.diagnosis import diagnose, diagnose_fully
+from ident.diagnosis import diagnose, diagnose_fully, unsought
 from ident.estimate import fit_frf
 from ident.hypotheses import catalogue
 from ident.identification import identify
+from ident.notes import NOT_SOUGHT, TIME_UP
 from ident.parallel import GRACE, TimeIsUp, Workers, map_threads, open_executor
 from ident.problem import NOT_COMPUTED, predictions
 from ident.screening import screen
@@ -67,8 +69,25 @@ def test_a_search_without_time_says_so_and_names_nothing(friction):
     verdict = diagnose(friction[0], max_seconds=0.0)
     assert verdict.discrepancy.detected and not verdict.causes
     assert verdict.unexplained_verdict == "unknown cause remains"
-    assert "0 s for the search" in verdict.notes[-1]
+    assert "0 s for the search" in verdict.notes[-1] and "more may be found" in verdict.notes[-1]
+    assert verdict.sentence == "The simulation misses something, and no cause was searched for."
     assert json.loads(friction[1])["notes"] == []
+
+
+def test_where_no_causes_are_asked_for_nothing_is_said_of_what_the_catalogue_explains(friction):
+    verdict = diagnose(friction[0], max_causes=0)
+    assert verdict.discrepancy.detected and not verdict.causes and verdict.next_experiment is None
+    assert verdict.unexplained_verdict == "unknown cause remains"
+    assert verdict.sentence == "The simulation misses something, and no cause was searched for."
+
+
+def test_a_search_that_ended_before_it_found_anything_says_nothing_of_the_catalogue_either():
+    sought = SimpleNamespace(result=SimpleNamespace(rounds=()), late=True)
+    assert unsought(sought, begins=True) == TIME_UP and unsought(sought, begins=False) == NOT_SOUGHT
+    sought.late = False
+    assert unsought(sought, begins=True) == ""
+    sought.result.rounds = ("one",)
+    assert unsought(sought, begins=False) == ""
 
 
 def test_drives_that_were_fitted_from_guesses_are_told(friction):
