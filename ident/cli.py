@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import secrets
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,7 +24,13 @@ from robot_assets.values import exists
 if TYPE_CHECKING:
     from ident.verdict import Diagnosis
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, help="Find what a robot simulation gets wrong.")
+NARROW = 80  # columns, below which the tables of rich cut the names of options
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="Find what a robot simulation gets wrong.",
+    rich_markup_mode=None if shutil.get_terminal_size().columns < NARROW else "rich",
+)
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
 Out = Annotated[Path, typer.Option("--out", help="Where to write.")]
@@ -109,11 +116,20 @@ def experiment(
     robot: str,
     out: Out,
     effect: Annotated[
-        list[str] | None, typer.Option("--effect", help="NAME@PLACE:key=value,...; several hide several.")
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            help="NAME@PLACE:key=value with more keys behind commas; several hide several. Without keys their sizes are drawn. Names, places, keys: docs/effects.md.",
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of excitation, noise and drives.")] = 0,
-    realizations: Annotated[int, typer.Option(min=1, max=1000)] = 1,
-    points: Annotated[int, typer.Option(min=1, max=1000, help="Operating points for identification.")] = 2,
+    realizations: Annotated[int | None, typer.Option(min=1, max=1000, show_default="1, or of the plan")] = None,
+    points: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=1000, help="Operating points for identification.", show_default="2, or those of the plan"
+        ),
+    ] = None,
     drives: Annotated[str, typer.Option(help='"nominal", or "drawn" within a factor of two.')] = "nominal",
     plan: Annotated[
         Path | None, typer.Option(help="A plan written by `simgap design`, or next_plan.toml of a diagnosis.")
@@ -139,12 +155,15 @@ def experiment(
     from sim import parse_effect, run_experiment
     from sim.experiment import draw_drives
 
+    for option, given in (("--points", points), ("--realizations", realizations)):
+        if plan is not None and given is not None:
+            raise DataError(option, "command line", f"{given} beside --plan", "one of the two: the plan decides it")
     arm = _robot(robot)
     if drives not in ("nominal", "drawn"):
         raise DataError("--drives", "command line", drives, '"nominal" or "drawn"')
     hidden = [parse_effect(text, arm) for text in effect or []]
     figures = draw_drives(np.random.default_rng(seed + 1000), arm) if drives == "drawn" else None
-    made = plan_from_toml(plan) if plan else _plan(arm, points, realizations, seed, (1.0, 0.5, 0.25))
+    made = plan_from_toml(plan) if plan else _plan(arm, points or 2, realizations or 1, seed, (1.0, 0.5, 0.25))
     if made.robot.folder != arm.folder:
         raise DataError("--plan", str(plan), f"a plan for {made.robot.name}", f"one for {arm.name}")
     _check_out(check_target(out))
@@ -168,6 +187,28 @@ def _one_recording(plan, effects, **run):
 
     schedule = schedule_plan(plan)
     return cut_recording(run_recording(schedule, effects, **run), schedule), usage(schedule)
+
+
+@app.command()
+def merge(
+    datasets: list[Path],
+    out: Out,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Several datasets of one robot as one, as the first data and those of next_plan.toml."""
+    from ident.dataset_io import check_target, load_dataset, save_dataset
+    from ident.merging import merged
+
+    _check_out(check_target(out))
+    data = merged([load_dataset(path) for path in datasets], name=out.name)
+    save_dataset(data, out)
+    points = len({s.operating_point for s in data.segments} - {None})
+    _print(
+        {"dataset": str(out), "segments": len(data.segments), "operating_points": points},
+        json_,
+        f"{len(data.segments)} segments at {points} operating points in {out}",
+    )
 
 
 @app.command()
@@ -298,6 +339,8 @@ def demo(
     from sim.effects import parameters_of
     from sim.experiment import draw_drives
 
+    if real is not None and seed is not None:
+        raise DataError("--seed", "command line", f"{seed} beside --real", "one of the two: real data are not drawn")
     _check_out(out)
     if real is not None:
         return _demo_real(real, out, json_, quiet)

@@ -17,7 +17,7 @@ class DataError(Exception):
 
     def __init__(self, what: str, where: str, found: str, expected: str) -> None:
         self.what, self.where, self.found, self.expected = what, where, found, expected
-        super().__init__(f"{_line(what)}: {_line(where, 400)}: found {_line(found)}, expected {_line(expected, 400)}")
+        super().__init__(f"{_line(what)}: {_line(where, 400)}: found {_line(found)}, expected {_line(expected, 600)}")
 
     def __reduce__(self) -> tuple:
         """As it was made: it reaches other processes."""

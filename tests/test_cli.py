@@ -1,6 +1,7 @@
 """The command line as a user calls it."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +11,11 @@ import numpy as np
 import pytest
 
 import ident
-from ident.dataset_io import save_dataset
+from ident.dataset_io import load_dataset, save_dataset
+from ident.plan_file import plan_to_toml
+from robot_assets.robot import load_robot
+from sim import run_experiment
+from tests.conftest import small_plan
 
 pytestmark = pytest.mark.xdist_group("cli")  # one worker makes what they share
 
@@ -116,9 +121,13 @@ def test_experiment_writes_a_dataset_that_checks(bench):
         ("experiment", "ur10", "--out", "d", "--points", "0"),
         ("show", "no-such-folder"),
         ("demo", "--out", "d", "--real", "nothing"),
+        ("demo", "--out", "d", "--real", "twomass", "--seed", "3"),
+        ("experiment", "twomass", "--out", "d", "--plan", "plan.toml", "--points", "5"),
+        ("experiment", "twomass", "--out", "d", "--plan", "plan.toml", "--realizations", "1"),
+        ("merge", "no-such-folder", "--out", "d"),
         ("dance",),
     ],
-    ids=lambda a: "-".join(a[:2]),
+    ids="-".join,
 )
 def test_bad_usage_is_one_line_and_status_two(args, tmp_path):
     run = subprocess.run(
@@ -245,3 +254,46 @@ def test_the_status_of_the_viewer_is_that_of_show(tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert end.value.code == 3
+
+
+def test_what_a_plan_decides_is_not_asked_for_beside_it(tmp_path):
+    from ident.cli import experiment
+    from robot_assets.errors import DataError
+
+    with pytest.raises(DataError, match="--realizations: command line: found 3 beside --plan, expected one of the two"):
+        experiment("twomass", tmp_path / "d", plan=tmp_path / "plan.toml", realizations=3)
+
+
+def test_the_data_of_a_plan_join_the_first_ones(tmp_path):
+    plan = small_plan(load_robot("twomass"), 3, points=1, levels=(1.0,), period=1000)
+    plan_to_toml(plan, tmp_path / "next_plan.toml")
+    save_dataset(run_experiment(plan, seed=3), tmp_path / "first")
+    run = simgap(
+        "experiment", "twomass", "--plan", tmp_path / "next_plan.toml", "--seed", 5, "--out", tmp_path / "more"
+    )
+    assert run.returncode == 0, run.stderr
+    run = simgap("merge", tmp_path / "first", tmp_path / "more", "--out", tmp_path / "both", "--json")
+    assert (
+        run.returncode == 0
+        and json.loads(run.stdout)["segments"] == 4
+        and json.loads(run.stdout)["operating_points"] == 4
+    )
+    assert simgap("check", tmp_path / "both").returncode == 0
+    run = simgap("merge", tmp_path / "first", tmp_path / "first", "--out", tmp_path / "both")
+    assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1
+    assert len(load_dataset(tmp_path / "both").segments) == 4
+    # In the place of one of them, as it is read before it is written.
+    assert simgap("merge", tmp_path / "first", tmp_path / "more", "--out", tmp_path / "first").returncode == 0
+    assert len(load_dataset(tmp_path / "first").segments) == 4
+
+
+def test_names_of_options_stand_in_full_in_a_narrow_terminal():
+    run = subprocess.run(
+        [sys.executable, "-m", "ident.cli", "diagnose", "--help"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+        env=os.environ | {"COLUMNS": "40"},
+    )
+    assert "--max-causes" in run.stdout and "--max-seconds" in run.stdout

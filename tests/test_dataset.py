@@ -13,6 +13,7 @@ import ident
 from ident.dataset import Dataset, Segment
 from ident.dataset_io import load_dataset, save_dataset
 from ident.format_checks import checked
+from ident.merging import merged
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 
@@ -335,3 +336,43 @@ def test_a_dataset_of_other_numbers_has_the_same_frf(clean):
     data = clean[0]
     single_ones = replace(data, segments=tuple(map(single, data.segments)))
     np.testing.assert_allclose(ident.estimate_frf(single_ones).G, ident.estimate_frf(data).G, rtol=1e-4)
+
+
+def test_two_datasets_become_one_in_which_every_experiment_keeps_its_own_name(folder, tmp_path):
+    data = folder[1]
+    a, b = data.segments
+    more = replace(data, name="more", segments=(replace(a, q=a.q + 1.0), replace(b, name="c", q=b.q + 1.0)))
+    both = merged([data, more, replace(more, segments=(replace(a, q=a.q + 2.0),))], "both")
+    assert [s.name for s in both.segments] == ["a", "b", "a-2", "c", "a-3"]
+    assert [s.operating_point for s in both.segments] == ["op01", None, "op01-2", None, "op01-3"]
+    save_dataset(both, tmp_path / "both")
+    again = load_dataset(tmp_path / "both")
+    assert again.name == "both" and np.array_equal(again.segments[2].q, a.q + 1.0)
+
+
+def test_a_name_with_a_number_that_is_there_already_is_left_alone(folder):
+    data = folder[1]
+    a = data.segments[0]
+    named = tuple(
+        replace(a, name=n, operating_point=p, q=a.q + k)
+        for k, (n, p) in enumerate([("a-2", "op01-2"), ("a", "op01")], 1)
+    )
+    both = merged([replace(data, segments=(a,)), replace(data, segments=named)], "both")
+    assert [s.name for s in both.segments] == ["a", "a-2", "a-3"]
+    assert [s.operating_point for s in both.segments] == ["op01", "op01-2", "op01-3"]
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (lambda d: replace(d, sample_rate=500.0), "sample_rate: .*found 500.0, expected 1000.0, as in small"),
+        (lambda d: replace(d, tau_std=None), "tau_std: .*found none"),
+        (lambda d: replace(d, robot=load_robot("twomass")), "robot: .*twomass, expected that of small"),
+        (lambda d: d, "segment: .*a with the samples of a"),
+    ],
+)
+def test_datasets_that_do_not_belong_together_are_refused(folder, other, message):
+    with pytest.raises(DataError, match=message):
+        merged([folder[1], replace(other(folder[1]), name="second")], "both")
+    with pytest.raises(DataError, match="found 1, expected at least two"):
+        merged([folder[1]], "both")

@@ -1,6 +1,9 @@
 """The plant against closed forms and against its own description."""
 
+import dataclasses
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -275,6 +278,37 @@ def test_a_wrong_effect_is_one_clear_error(ur10, text, found):
         return
     with pytest.raises(DataError, match=found):
         parse_effect(text, ur10)
+
+
+def test_an_effect_that_there_is_not_is_told_all_that_there_are(ur10):
+    with pytest.raises(DataError) as refused:
+        parse_effect("magic@elbow_joint", ur10)
+    assert all(name in str(refused.value) for name in EFFECTS) and "..." not in str(refused.value)
+
+
+def test_the_page_of_effects_has_every_effect_with_its_keys(ur10):
+    page = (Path(__file__).parent.parent / "docs" / "effects.md").read_text()
+    rows = [row.split(" | ") for row in re.findall(r"^\| (`.*) \|$", page, re.MULTILINE)]
+    told = {
+        name.strip("`"): (place, re.findall(r"`(\w+)(?:=([^`]*))?` \(|`(channel)=(q)`", keys))
+        for name, place, keys, _ in rows
+    }
+    assert list(told) == list(EFFECTS)
+    for name, cls in EFFECTS.items():
+        place, keys = told[name]
+        found = {key or channel: default or q for key, default, channel, q in keys}
+        fields = [f for f in dataclasses.fields(cls) if f.name != "place"]
+        assert list(found) == [f.name.rstrip("_") for f in fields], name
+        for f, default in zip(fields, found.values(), strict=True):
+            if f.default is dataclasses.MISSING:
+                assert default == "", name
+            elif isinstance(f.default, tuple):
+                assert tuple(map(float, default.split())) == f.default, name
+            else:
+                assert type(f.default)(default) == f.default, name
+        where = valid_places(name, ur10)
+        kind = {"joint": list(ur10.joint_names), "joint, not the last": list(ur10.joint_names)[:-1]}
+        assert place in ("link", f"`{where[0]}`") or set(where) <= set(kind[place]), name
 
 
 def test_a_centre_of_mass_is_read_as_three_numbers_or_in_parts(ur10):

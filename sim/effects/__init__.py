@@ -89,7 +89,7 @@ def make_effect(name: str, place: str, **values: Any) -> Effect:
         DataError: for a name, place or parameter that there is not, or parameters that contradict each other.
     """
     if name not in EFFECTS:
-        raise DataError("effect", name, "no such effect", f"one of {sorted(EFFECTS)}")
+        raise DataError("effect", name, "no such effect", f"one of {', '.join(sorted(EFFECTS))}")
     cls = EFFECTS[name]
     fields = {f.name.rstrip("_"): f for f in dataclasses.fields(cls) if f.name != "place"}
     values = _center_of_mass(values, fields, f"{name}@{place}")
@@ -119,7 +119,7 @@ def parse_effect(text: str, robot: Robot) -> Effect:
         raise DataError("effect", text, "another form", "NAME@PLACE:key=value,...")
     name, place, rest = match.groups()
     if name not in EFFECTS:
-        raise DataError("effect", text, name, f"one of {sorted(EFFECTS)}")
+        raise DataError("effect", text, name, f"one of {', '.join(sorted(EFFECTS))}")
     places = valid_places(name, robot)
     if place not in places:
         raise DataError("place", text, place, f"one of {places}")
