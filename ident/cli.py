@@ -532,7 +532,7 @@ def _verdict_text(diagnosis: Diagnosis, out: Path) -> str:
     verdict = diagnosis.verdict
     lines = [verdict.sentence]
     for cause in verdict.causes:
-        values = ", ".join(f"{k} {v.value:.4g} ± {v.std:.2g}{unit_suffix(v.unit)}" for k, v in cause.parameters.items())
+        values = ", ".join(f"{k} {v.told:.4g} ± {v.std:.2g}{unit_suffix(v.unit)}" for k, v in cause.parameters.items())
         lines.append(f"  {cause.effect} at {cause.joint}, probability {cause.probability:.3f}: {values}")
         lines += [f"    or {a.effect} at {a.joint}, {a.probability:.3f}" for a in cause.alternatives]
     if verdict.gain is not None:

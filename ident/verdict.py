@@ -17,6 +17,7 @@ from robot_assets.robot import Robot
 
 SCHEMA = "simgap-verdict/1"
 UNKNOWN = "unknown cause remains"
+NOTHING = 1e-3  # of a standard deviation, below which a value is told as zero
 LEFT_OUT = "leave-one-operating-point-out"
 
 
@@ -27,6 +28,11 @@ class Value:
     value: float
     std: float
     unit: str
+
+    @property
+    def told(self) -> float:
+        """The value as people are told it: zero where it is nothing beside its standard deviation."""
+        return 0.0 if abs(self.value) < NOTHING * self.std else self.value + 0.0
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ident.plan_file import plan_from_toml
 from ident.show.export import build_mjcf
 from ident.show.figures import rounded, trace_figure
 from ident.show.outputs import write_outputs
-from ident.show.report import write_report
+from ident.show.report import unbroken, write_report
 from ident.verdict import (
     Cause,
     Diagnosis,
@@ -361,3 +361,21 @@ def test_numbers_are_rounded_to_their_standard_deviation():
     assert rounded(2.9e-05, 3.8e-05) == "(2.9 ± 3.8)·10⁻⁵"
     assert rounded(1.0, 0.0) == "1"
     assert rounded(1.5, float("nan")) == "1.5 ± nan"
+
+
+def test_numbers_have_no_sign_of_zero_and_no_more_digits_than_anyone_reads():
+    assert rounded(-1e-6, 9.3e-4) == "(0.0 ± 9.3)·10⁻⁴"
+    assert rounded(-3.983e-43, 0.2) == "0.00 ± 0.20"
+    assert rounded(-0.0, 0.0) == "0"
+    assert rounded(4.836365824305e-5, 4.4e-16) == "4.83637·10⁻⁵ ± 4.4·10⁻¹⁶"
+    assert rounded(-20123.456789, 1e-7) == "-20123.5 ± 1·10⁻⁷"
+    assert rounded(20123.456, 0.36) == "20123.5 ± 0.36" and rounded(2012.345, 0.36) == "2012.35 ± 0.36"
+
+
+def test_a_value_far_below_its_deviation_is_told_as_zero():
+    assert Value(-3.983e-43, 0.2, "m").told == 0.0 and str(Value(-0.0, 0.0, "m").told) == "0.0"
+    assert Value(-0.1, 0.2, "m").told == -0.1 and Value(1.5, float("nan"), "m").told == 1.5
+
+
+def test_units_of_the_report_do_not_break():
+    assert unbroken(" N m/rad") == "\N{NO-BREAK SPACE}N\N{NO-BREAK SPACE}m/rad"

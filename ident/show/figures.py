@@ -52,20 +52,41 @@ STYLE: dict[RcKeyType, Any] = {
 POINTS = 1500
 CURVE = 300
 FREQUENCIES = 1.0, 2.0, 5.0  # that are told of each decade
+MOST_DIGITS = 6  # of a number, however small its standard deviation
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def rounded(value: float, std: float) -> str:
-    """A number and its standard deviation, both to two digits of the latter."""
+    """A number and its standard deviation, both to two digits of the latter; the number to no more than
+    ``MOST_DIGITS``."""
     if not (np.isfinite(std) and std > 0 and np.isfinite(value)):
-        return f"{value:.5g}" if std == 0 else f"{value:.5g} ± {std:.2g}"
+        return f"{value + 0.0:.5g}" if std == 0 else f"{value + 0.0:.5g} ± {std:.2g}"
     size = max(abs(value), std)
+    power, last = (int(np.floor(np.log10(x))) for x in (size, std))
+    if power - last + 2 > MOST_DIGITS:
+        return f"{_by_power(value, MOST_DIGITS)} ± {_by_power(std, 2)}"
     if not 1e-3 <= size < 1e6:
-        power = int(np.floor(np.log10(size)))
-        decimals = max(0, power - int(np.floor(np.log10(std))) + 1)
-        return f"({value / 10.0**power:.{decimals}f} ± {std / 10.0**power:.{decimals}f})·10{str(power).translate(SUPERSCRIPT)}"
-    decimals = max(0, 1 - int(np.floor(np.log10(std))))
-    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+        decimals = max(0, power - last + 1)
+        return f"({_fixed(value / 10.0**power, decimals)} ± {std / 10.0**power:.{decimals}f}){_power(power)}"
+    decimals = max(0, 1 - last)
+    return f"{_fixed(value, decimals)} ± {std:.{decimals}f}"
+
+
+def _fixed(value: float, decimals: int) -> str:
+    """A number with so many decimals; no zero has a sign."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"
+
+
+def _by_power(value: float, digits: int) -> str:
+    """A number with so many digits, by its power of ten where it is very small or large."""
+    if 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits}g}"
+    power = int(np.floor(np.log10(abs(value))))
+    return f"{value / 10.0**power:.{digits}g}{_power(power)}"
+
+
+def _power(exponent: int) -> str:
+    return f"·10{str(exponent).translate(SUPERSCRIPT)}"
 
 
 def _subplots(rows: int = 1, columns: int = 1, **options):

@@ -38,11 +38,13 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         inertial=(*INERTIAL, "torque_offset"),
         unit=parameter_unit,
         rounded=rounded,
-        unit_suffix=unit_suffix,
-        torque_unit=torque_unit(robot, of_gain),
+        unit_suffix=lambda unit: unbroken(unit_suffix(unit)),
+        torque_unit=unbroken(torque_unit(robot, of_gain)),
         response_unit=response_unit(robot),
         table=parameter_table(diagnosis.verdict.baseline),
-        grid=[(view.operating_point, frf_grid_figure(view, joints)) for view in _worst(diagnosis.frf)[:1]],
+        grid=[
+            (view.operating_point, frf_grid_figure(view, joints)) for view in _worst(diagnosis.frf)[: len(joints) > 1]
+        ],
         frfs=[
             (view.operating_point, frf_figure(view, joints, response_unit(robot))) for view in diagnosis.frf[:MAX_FRFS]
         ],
@@ -53,6 +55,11 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         ],
     )
     path.write_text(html, encoding="utf-8")
+
+
+def unbroken(text: str) -> str:
+    """A text that stays on one line."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def parameter_table(baseline: dict[str, Value]) -> dict[str, dict[str, Value]]:
