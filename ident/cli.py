@@ -119,7 +119,7 @@ def experiment(
         list[str] | None,
         typer.Option(
             "--effect",
-            help="NAME@PLACE:key=value with more keys behind commas; several hide several. Without keys their sizes are drawn. Names, places, keys: docs/effects.md.",
+            help="NAME@PLACE:key=value with more keys behind commas; several hide several. Without keys they have sizes of their own. Names, places, keys: docs/effects.md.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of excitation, noise and drives.")] = 0,

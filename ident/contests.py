@@ -239,11 +239,12 @@ def wider_laws(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis
 
 def forms_to_try(problem: Problem, current: Fit, h: Hypothesis) -> list[Hypothesis]:
     """``wider_forms`` where the joint of a law has more than noise left, which no other joint answers for; in motions
-    alone, below the modes of the links, of bundles and springs on the links only."""
+    alone, below the modes of the links, of bundles only: a spring with the friction of its joint looks like one.
+    """
     if h.joint < 0 or not unsettled_at(current, h.joint):
         return []
     forms = wider_forms(h, leads=not problem.motions_alone)
-    return [x for x in forms if x.effect == "dress_pack"] if problem.motions_alone else forms
+    return [x for x in forms if x.effect == h.effect == "dress_pack"] if problem.motions_alone else forms
 
 
 def nearly_settled(problem: Problem, current: Fit, h: Hypothesis) -> bool:

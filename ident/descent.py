@@ -128,13 +128,13 @@ def descend(
     """
     if criterion.share:
         b = b - criterion.share * shared_slope(criterion.problem, at.model, at.predictions, criterion.weights)
-    step, found = _tried(criterion, at, H, b, damping, anew, np.ones(len(at.x), bool))
+    step, taken = _tried(criterion, at, H, b, damping, anew, np.ones(len(at.x), bool))
     free = ~nuisances(at.model)
     if step is None and not np.all(free) and not is_slow(at.model) and _foretold(criterion, at, H, b, free) > SLIGHT:
         # A law may jump with one of them, as a friction does where rest is no longer told from a slow turn, and no step
         # leads there.
-        step, _ = _tried(criterion, at, H, b, damping, anew, free)
-    return step, found if step is None else damping
+        return _tried(criterion, at, H, b, damping, anew, free)
+    return step, taken
 
 
 def _tried(

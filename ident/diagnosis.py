@@ -126,7 +126,7 @@ def diagnose_fully(
         told = (left.text if left else "") + nameless_law(result, problem.structure)
         verdict = replace(verdict, residual_description=told.strip())
     if sought.late:
-        notes.append(time_note(max_seconds, bool(verdict.causes) and verdict.unexplained_verdict != UNKNOWN))
+        notes.append(time_note(max_seconds, verdict.unexplained_verdict != UNKNOWN))
     notes += (f"Not used: {line}." for line in not_fitted(given))
     if guessed := guessed_drives(dataset.robot):
         notes.append(f"The drives of {', '.join(guessed)} were fitted from guesses: robot.toml does not know them.")

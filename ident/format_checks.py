@@ -35,8 +35,8 @@ def checked(dataset: Dataset) -> Dataset:
     where = f"dataset {dataset.name}"
     if not isinstance(dataset.robot, Robot):
         raise DataError("robot", where, f"a {type(dataset.robot).__name__}", "a Robot, as of load_robot")
-    names = tuple(dataset.joints or ())
-    if names != dataset.robot.joint_names:
+    names = dataset.joints
+    if not isinstance(names, (tuple, list)) or tuple(names) != dataset.robot.joint_names:
         raise DataError("joints", where, show(names), f"those of the robot: {show(dataset.robot.joint_names)}")
     head = _plain(vars(dataset))
     rate = sample_rate(head, where)

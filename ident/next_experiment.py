@@ -29,7 +29,7 @@ from ident.problem import NOT_COMPUTED, Problem
 from ident.torque_fit import Fit
 from ident.verdict import Cause
 from ident.weights import make_weights
-from robot_assets.robot import linear_joints
+from robot_assets.robot import Robot, linear_joints
 
 TIED = 0.1  # probability from which a second hypothesis is worth an experiment
 ENOUGH = 5.0  # nats of expected evidence that settle a tie
@@ -144,9 +144,19 @@ def _options(problem: Problem, groups: Sequence[Group], joint: int) -> Iterator[
                 if factor > 1.0 and np.any(np.abs(top.U[:, 0]).max(axis=0) + factor * _peak(top) > limit):
                     continue
                 for shift in longest * np.array(SHIFTS):
-                    inside = robot.q_min[j] < top.posture[j] + shift < robot.q_max[j]
-                    if (factor, shift) != (1.0, 0.0) and (inside or shift == 0.0):
+                    if (factor, shift) != (1.0, 0.0) and within_reach(robot, top, factor, j, shift):
                         yield _Option(moved(top, factor, j, shift), factor, j, float(shift))
+
+
+def within_reach(robot: Robot, group: Group, factor: float, joint: int, shift: float) -> bool:
+    """Whether the motion of ``moved`` keeps to range and speed of every joint that it makes move further."""
+    Q = group.Q.copy()
+    Q[:, 0] = 0.0
+    peak, fastest = (factor * np.abs(group.to_time(x)).max(axis=(0, 1)) for x in (Q, 1j * group.omega[:, None] * Q))
+    at = group.posture.copy()
+    at[joint] += shift
+    inside = (robot.q_min < at - peak) & (at + peak < robot.q_max) & (fastest < robot.array("velocity_limit"))
+    return bool(np.all(inside) if factor > 1.0 else inside[joint] or shift == 0.0)
 
 
 def moved(group: Group, factor: float, joint: int, shift: float) -> Group:

@@ -25,6 +25,8 @@ from ident.verdict import Alternative, Cause, Gain
 FAR_OFF = 1.5  # error of held-out data over their noise, from which it is told
 ALONG = 0.8  # error of held-out data along the record over that of a simulation, below which both are told
 NAMED = 0.5  # probability above which a cause is taken as named
+LEAST_GIVEN = 1e-12  # N m, of noise that is given
+LOUDER = 1.1  # noise of a joint over that which is given, that is more
 TIE = 0.5  # of the probability of a cause, above which a rival ties with it
 NOT_SOUGHT = "no cause was searched for"
 TIME_UP = "the time for the search was used up before a cause was found"
@@ -162,11 +164,12 @@ def noise_note(problem: Problem, given: np.ndarray) -> tuple[str, ...]:
     """
     if not problem.noise_denied:
         return ()
-    over = problem.tau_std / given
+    over = problem.tau_std / np.maximum(given, LEAST_GIVEN)
+    joints = "all" if over.min() > LOUDER else "most"
     return (
         f"In the compared band the torque holds {over.min():.2g} to {over.max():.2g} times the noise that the dataset gives, alike"
-        " at all joints and lines, as noise does of which neighbouring samples go together. It is taken for that, and not"
-        " for a cause.",
+        f" at {joints} joints and all lines, as noise does of which neighbouring samples go together. It is taken for that,"
+        " and not for a cause.",
     )
 
 
@@ -240,9 +243,9 @@ def time_note(seconds: float, nothing_left: bool) -> str:
     """A search that ended for want of time.
 
     Args:
-        nothing_left: whether what was found leaves noise alone.
+        nothing_left: whether noise alone is left.
     """
-    more = "; what was found leaves no more than noise" if nothing_left else ": with more time more may be found"
+    more = "; no more than noise is left" if nothing_left else ": with more time more may be found"
     return f"The {seconds:g} s for the search for causes are used up{more}."
 
 

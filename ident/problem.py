@@ -35,7 +35,7 @@ class Problem:
         scatter_share: of what the scatter between periods says that noise adds to costs, that is taken off where these
             are compared; that which the baseline has borne, none before it is known.
         noise_left: whether ``tau_std`` is what a model has left: errors of its laws are in it.
-        noise_denied: whether it is more than the dataset gives, as motions show.
+        noise_denied: whether it is more than the dataset gives, as fast lines of motions show, or lines that nothing excites.
     """
 
     structure: Structure

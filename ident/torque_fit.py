@@ -94,7 +94,7 @@ class Fit:
         """
         m = len(self.model.par.to_log())
         known = [
-            q.expected_spread(v) ** -2 if q.log or q.bounded else 0.0
+            q.spread_allowed(v) ** -2 if q.log or q.bounded else 0.0
             for effect in self.model.effects
             for q, v in zip(effect.hypothesis.parameters, effect.p, strict=True)
         ]
@@ -216,14 +216,12 @@ def fit(
             continue
         if not (slow and abs(step.gain - step.foretold) <= max(FORETOLD * step.foretold, SLIGHT)):
             columns = []
-        if exact and not fine and HARDLY_LESS * last < step.gain < last:  # along a valley that these columns do not see
-            fine, columns = True, []
-        last = step.gain
         drift += np.abs(step.to.x - at.x)
         at, damping = step.to, max(damping / LESS_DAMPING, LEAST_DAMPING)
         if np.max(np.where(moves, drift, 0.0)) > STALE:
             at, drift = criterion.settled(settled, at), np.zeros(len(at.x))
             if at is settled:
+                last = 0.0
                 damping, columns = max(damping, LEAST_RAISED) * SHORTER, []
                 continue
             settled = at
@@ -234,6 +232,9 @@ def fit(
             if converged:
                 break
             fine, columns = True, []
+        if exact and not fine and HARDLY_LESS * last < step.gain < last:  # along a valley that these columns do not see
+            fine, columns = True, []
+        last = step.gain
         if step.gain < CREEPING * (at.cost - aim):
             break
     if np.any(drift):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
 from dataclasses import asdict, dataclass, field
@@ -32,7 +33,7 @@ class Value:
     @property
     def told(self) -> float:
         """The value as people are told it: zero where it is nothing beside its standard deviation."""
-        return 0.0 if abs(self.value) < NOTHING * self.std else self.value + 0.0
+        return 0.0 if abs(self.value) < NOTHING * self.std < math.inf else self.value + 0.0
 
 
 @dataclass(frozen=True)

@@ -236,6 +236,8 @@ def test_an_interrupted_command_ends_with_status_130_in_one_line_and_writes_noth
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # A shell starts what runs behind it with interrupts ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert run.stderr.readline()  # of its progress: it is at work
     run.send_signal(signal.SIGINT)

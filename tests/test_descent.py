@@ -33,8 +33,11 @@ class Bowl(Criterion):
     """``value``, and a jump where the last coordinate grows."""
 
     jumps: bool = False
+    longest: float = np.inf
 
     def stepped(self, at, step, anew):
+        if np.linalg.norm(step) > self.longest:
+            return None
         x = at.x + step
         jump = JUMP if self.jumps and x[-1] > at.x[-1] else 0.0
         return Point(at.model, x, [], [], value(x) + jump)
@@ -43,10 +46,10 @@ class Bowl(Criterion):
         return step
 
 
-def step_of(jumps, last_is_nuisance, monkeypatch, x=np.zeros(3)):
+def step_of(jumps, last_is_nuisance, monkeypatch, x=np.zeros(3), longest=np.inf):
     monkeypatch.setattr("ident.descent.is_slow", lambda model: False)
     here = Point(model(False, last_is_nuisance), x, [], [], value(x))
-    bowl = Bowl(None, None, np.zeros(3), np.zeros(3), jumps=jumps)
+    bowl = Bowl(None, None, np.zeros(3), np.zeros(3), jumps=jumps, longest=longest)
     return descend(bowl, here, CURVATURE, CURVATURE @ (LOWEST - x), 1e-9, False)
 
 
@@ -54,6 +57,15 @@ def test_a_step_leads_to_the_lowest_point_of_a_paraboloid(monkeypatch):
     step, damping = step_of(False, True, monkeypatch)
     assert step.to.x == pytest.approx(LOWEST, rel=1e-6) and damping == 1e-9
     assert step.gain == pytest.approx(step.foretold)
+
+
+def test_a_step_says_by_which_damping_it_was_taken(monkeypatch):
+    """The next one begins there: where it does not, each climbs up to it again."""
+    whole = np.linalg.norm(LOWEST)
+    step, damping = step_of(False, True, monkeypatch, longest=0.9 * whole)
+    assert 1e-2 < damping < 10.0 and np.linalg.norm(step.to.x) < 0.9 * whole
+    step, damping = step_of(True, True, monkeypatch, longest=0.5 * whole)
+    assert damping == 1e-9 and step.to.x[-1] == 0.0
 
 
 def test_where_a_law_jumps_with_how_it_is_formed_the_others_step_on(monkeypatch):

@@ -959,7 +959,7 @@ def test_a_motor_that_creeps_in_its_friction_is_no_drive_that_saturates(tmp_path
 def test_a_motor_that_friction_holds_altogether_is_said_not_to_move(tmp_path):
     robot = load_robot("twomass")
     data = quick_experiment(
-        small_plan(robot, 4, period=1000), [parse_effect("coulomb_friction@drive:torque=0.3", robot)], seed=4
+        small_plan(robot, 4, period=1000), [parse_effect("coulomb_friction@drive:torque=3.0", robot)], seed=4
     )
     with pytest.raises(DataError, match="no joint that moves"):
         diagnose(through_files(data, tmp_path))
@@ -1662,6 +1662,7 @@ def test_a_factor_is_as_large_as_it_differs_from_none(value, spread):
     q = Parameter("scale", "1", 0.2, 5.0, log=True, null=1.0)
     assert q.expected_spread(value) == pytest.approx(spread)
     assert replace(q, null=None).expected_spread(value) == LOG_SPREAD
+    assert q.spread_allowed(value) == LOG_SPREAD  # of which its standard deviation does not fall short by that alone
 
 
 @pytest.mark.parametrize(("left", "fitted"), [(0.99, 1), (0.5, 2)])

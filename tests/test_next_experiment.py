@@ -9,7 +9,7 @@ import pytest
 from ident.evidence import Candidate
 from ident.hypotheses import catalogue
 from ident.model import Effect, Model
-from ident.next_experiment import _Option, _options, _separation, advice, moved, separating_experiment
+from ident.next_experiment import _Option, _options, _separation, advice, moved, separating_experiment, within_reach
 from ident.plan_file import plan_from_toml, plan_to_toml
 from ident.torque_fit import fit
 
@@ -99,6 +99,24 @@ def test_an_axis_is_moved_by_no_more_than_it_has_room_for(fitted, joint):
     short = replace(robot, q_min=at - 0.1, q_max=at + 0.1)
     options = list(_options(SimpleNamespace(structure=SimpleNamespace(robot=short)), groups[:1], joint))
     assert {round(o.shift, 9) for o in options} >= {-0.06, 0.06} and all(abs(o.shift) < 0.061 for o in options)
+
+
+def test_a_motion_that_leaves_the_range_or_is_too_fast_is_not_planned(fitted):
+    problem = fitted[0]
+    group = next(g for g in problem.groups if g.window is None)
+    robot, joint = problem.structure.robot, 2
+    at, Q = group.posture, group.Q * (group.omega > 0)[:, None]
+    swing = np.abs(group.to_time(Q)).max(axis=(0, 1))
+    fastest = np.abs(group.to_time(1j * group.omega[:, None] * Q)).max(axis=(0, 1))
+    room = replace(robot, q_min=at - 3.0 * swing, q_max=at + 3.0 * swing)
+    assert within_reach(room, group, 2.0, joint, 0.0)
+    assert not within_reach(room, group, 4.0, joint, 0.0)
+    assert within_reach(room, group, 1.0, joint, 1.5 * swing[joint])
+    assert not within_reach(room, group, 1.0, joint, 2.5 * swing[joint])
+    slow = replace(
+        room, joints=tuple(replace(j, velocity_limit=1.5 * v) for j, v in zip(robot.joints, fastest, strict=True))
+    )
+    assert not within_reach(slow, group, 2.0, joint, 0.0) and within_reach(slow, group, 1.0, joint, 0.0)
 
 
 def test_where_no_experiment_can_be_made_none_is_planned(fitted, monkeypatch):

@@ -369,10 +369,14 @@ def test_numbers_have_no_sign_of_zero_and_no_more_digits_than_anyone_reads():
     assert rounded(-0.0, 0.0) == "0"
     assert rounded(4.836365824305e-5, 4.4e-16) == "4.83637·10⁻⁵ ± 4.4·10⁻¹⁶"
     assert rounded(-20123.456789, 1e-7) == "-20123.5 ± 1·10⁻⁷"
+    assert rounded(1.23456789e9, 360.0) == "1.23457·10⁹ ± 360"
+    assert rounded(1.2e7, 150.0) == "1.2·10⁷ ± 150" and rounded(999999.7, 1e-3) == "1·10⁶ ± 0.0010"
+    assert rounded(9.99999999e-5, 1e-14) == "1·10⁻⁴ ± 1·10⁻¹⁴"
     assert rounded(20123.456, 0.36) == "20123.5 ± 0.36" and rounded(2012.345, 0.36) == "2012.35 ± 0.36"
 
 
 def test_a_value_far_below_its_deviation_is_told_as_zero():
+    assert Value(3.0, np.inf, "m").told == 3.0
     assert Value(-3.983e-43, 0.2, "m").told == 0.0 and str(Value(-0.0, 0.0, "m").told) == "0.0"
     assert Value(-0.1, 0.2, "m").told == -0.1 and Value(1.5, float("nan"), "m").told == 1.5
 

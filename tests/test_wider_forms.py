@@ -126,4 +126,6 @@ def test_a_bundle_at_rest_elsewhere_is_asked_for_in_motions_too(locked, monkeypa
     assert hung.options["widens"](p, None)[0].tolist() == [*p, 0.0]
     assert hung.options["narrow"](np.array([*p, 0.3])).tolist() == p.tolist()
     lag = next(h for h in laws if h.effect == "torque_lag")
-    assert bool(forms_to_try(problem, None, lag)) != motions
+    spring = next(h for h in laws if h.effect == "gravity_spring" and "holds" not in h.options)
+    for other in (lag, spring):
+        assert bool(forms_to_try(problem, None, other)) != motions

@@ -73,13 +73,19 @@ class Parameter:
         return self.unit == "1" and self.upper - self.lower <= UNIT_RANGE
 
     def expected_spread(self, value: float) -> float:
-        """Standard deviation before the data, fitted coordinates: where nothing is said the size of the value, of a
-        factor that by which it differs from none."""
+        """Standard deviation before the data that a value is charged for, fitted coordinates: ``spread_allowed``, and of
+        a factor no more than that by which it differs from none."""
+        allowed = self.spread_allowed(value)
+        if not self.log or self.null is None or np.isfinite(self.spread):
+            return allowed
+        return min(max(abs(self.to_internal(value) - self.to_internal(self.null)), 1e-300), allowed)
+
+    def spread_allowed(self, value: float) -> float:
+        """Standard deviation before the data, fitted coordinates: of the size of the value where nothing is said."""
         if np.isfinite(self.spread):
             return self.spread
         if self.log:
-            off = LOG_SPREAD if self.null is None else abs(self.to_internal(value) - self.to_internal(self.null))
-            return min(max(off, 1e-300), LOG_SPREAD)
+            return LOG_SPREAD
         if self._pure:
             return (self.upper - self.lower) / np.sqrt(12.0)
         return max(abs(value), 1e-300)

@@ -79,10 +79,13 @@ def _fixed(value: float, decimals: int) -> str:
 
 def _by_power(value: float, digits: int) -> str:
     """A number with so many digits, by its power of ten where it is very small or large."""
-    if 1e-3 <= abs(value) < 1e6:
-        return f"{value:.{digits}g}"
-    power = int(np.floor(np.log10(abs(value))))
-    return f"{value / 10.0**power:.{digits}g}{_power(power)}"
+    if value == 0.0:
+        return "0"
+    shown = float(f"{value:.{digits}g}")
+    power = int(np.floor(np.log10(abs(shown)) + 1e-12))
+    if -3 <= power < MOST_DIGITS:
+        return f"{shown:.{max(0, digits - 1 - power)}f}"
+    return f"{shown / 10.0**power:.{digits}g}{_power(power)}"
 
 
 def _power(exponent: int) -> str:
