@@ -81,7 +81,7 @@ def seek(
     recorded = setup.problem.groups
     linked = None if mislabelled else by_link_encoders(dataset, setup, baseline, max_causes, workers)
     if linked is not None and explained(linked.result):
-        return replace(linked, late=workers.late)
+        return replace(gone_on_with(linked, max_causes, workers), late=workers.late)
     foretell = not mislabelled and setup.problem.motions_alone and inertias_foretell(setup)
     first_search = workers.for_half() if foretell else workers  # causes are then sought beside these inertias too
     guess = setup.problem.tau_std
@@ -95,6 +95,19 @@ def seek(
     if foretell and unresolved(result) and not workers.late:
         return with_inertias(found, max_causes, workers)
     return found
+
+
+def gone_on_with(found: Sought, max_causes: int, workers: Workers) -> Sought:
+    """A search that ended with its share of the time, gone on with in what is left of the whole; any other as it is."""
+    if not found.late or workers.late:
+        return found
+    try:
+        result = attribute(
+            found.setup.problem, found.baseline, max_causes=max_causes, known=found.result, workers=workers
+        )
+    except NOT_COMPUTED:
+        return found
+    return replace(found, result=result)
 
 
 def sought(

@@ -17,7 +17,7 @@ from ident.link_sensor import LinkDelay, comparable_links, find_link_delays, wit
 from ident.model import Effect, Model
 from ident.parallel import Workers
 from ident.problem import data_count, data_counts, predictions
-from ident.seek import by_link_encoders, seek
+from ident.seek import Sought, by_link_encoders, gone_on_with, seek
 from ident.weights import make_weights
 from sim.effects import parse_effect
 from sim.experiment import draw_drives
@@ -190,3 +190,13 @@ def test_filters_of_drives_and_sensors_leave_the_noise_of_all_outputs_a_covarian
     )
     weights = make_weights(problem, predictions(problem, model, [None] * len(problem.groups), steps=None), 0.0)
     assert all(np.linalg.eigvalsh(S).min() > 0.0 for S in weights.covariance)
+
+
+def test_a_search_by_link_encoders_goes_on_in_the_time_that_is_left(monkeypatch):
+    """It has half of the time, as the torque may be asked alone after it; where what it found stands there is more."""
+    monkeypatch.setattr("ident.seek.attribute", lambda problem, baseline, known, **rest: (problem, baseline, known))
+    setup = SimpleNamespace(problem="both")
+    ended = Sought(setup, (), "first", "causes", None, late=True)
+    assert gone_on_with(ended, 4, Workers()).result == ("both", "first", "causes")
+    assert gone_on_with(replace(ended, late=False), 4, Workers()).result == "causes"
+    assert gone_on_with(ended, 4, Workers(deadline=0.0)).result == "causes"
