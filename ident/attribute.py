@@ -329,8 +329,10 @@ def elsewhere(search: Search, joint: int) -> Search:
 
     Along measured motions the torque of one joint tells nothing of that of another.
     """
-    other = with_error_as_noise(search.problem, search.current, joint)
     left = tuple(h for h in search.hypotheses if h.joint != joint)
+    if len(left) == len(search.hypotheses):
+        return replace(search, over=True)
+    other = with_error_as_noise(search.problem, search.current, joint)
     return replace(search, problem=other, current=polish(other, search.current), hypotheses=left)
 
 

@@ -165,14 +165,17 @@ def occam(candidate: Candidate, temper: float) -> float:
     ``-log det(1 + P L / temper) / 2`` with the spread ``P`` of its parameters before the data and their
     information ``L`` with all other coordinates free (Laplace's approximation: MacKay, Neural Comput. 4,
     1992), and the density of the values themselves where there is a prior. A parameter that the data do
-    not determine costs nothing. One that they find absent costs what they lose without it, and more where it is what
+    not determine costs nothing, and one at a value that is usual no more than one that is absent. One that they find absent costs what they lose without it, and more where it is what
     makes the effect.
     """
     effect = candidate.fit.model.effects[-1]
     ps = effect.hypothesis.parameters
     H = candidate.fit.information
     x = np.array([q.to_internal(v) for q, v in zip(ps, effect.p, strict=True)])
-    nulls = np.array([np.nan if q.null is None else q.to_internal(q.null) for q in ps])
+    usual = effect.hypothesis.options.get("usual", lambda p: {})(effect.p)
+    nulls = np.array(
+        [np.nan if v is None else q.to_internal(v) for q, v in ((q, usual.get(q.name, q.null)) for q in ps)]
+    )
     covariance = temper * inverse(H, STEADY)[-len(ps) :, -len(ps) :]
     absent = np.abs(x - nulls) < ABSENT * np.sqrt(np.diag(covariance))
     without = 0.0

@@ -1656,6 +1656,26 @@ def test_bounds_say_how_large_a_pure_number_may_be_and_no_other(unit, spread):
     assert q.bounded == (unit == "1")
 
 
+@pytest.mark.parametrize("effect", ["transmission_error", "cogging"])
+def test_a_ripple_once_or_twice_in_a_turn_of_the_motor_is_not_charged_for_its_period(ur10, effect):
+    """An encoder out of centre is asked at these alone, and had won by that."""
+    laws = catalogue(build_structure(ur10))
+    h = next(x for x in laws if x.key == (effect, "elbow_joint"))
+    names = [q.name for q in h.parameters]
+    turns = ur10.joints[ur10.joint_names.index("elbow_joint")].gear_ratio
+    at, information = names.index(RIPPLE), np.full(len(names), 1e-9)
+    information[at] = 1e4
+
+    def charge(periods):
+        p = [1e-3 if q.null is None else q.null for q in h.parameters]
+        p[at] = periods
+        return occam(candidate(h, p, information), TEMPER)
+
+    for times in (1.0, 2.0):
+        assert charge(times * turns * (1.0 + 1e-5)) - charge(1.37 * turns) > 3.0
+    assert max(charge(x * turns) for x in (0.3, 1.37, 9.0)) < -5.0
+
+
 @pytest.mark.parametrize(("value", "spread"), [(0.97, -np.log(0.97)), (1.03, np.log(1.03)), (4.9, LOG_SPREAD)])
 def test_a_factor_is_as_large_as_it_differs_from_none(value, spread):
     """Charged for all sizes that it may have, a torque constant that is slightly off had lost against a load."""

@@ -7,16 +7,20 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from ident.attribute import Search, elsewhere
+from ident.baseline import fit_baseline
 from ident.conclude import _late
 from ident.coordinates import pack, unpack
 from ident.derivatives import jacobian
 from ident.diagnosis import diagnose, diagnose_fully
 from ident.hypotheses import catalogue
 from ident.identification import identify, set_up
+from ident.left_out import carries_over, link_errors, with_error_as_noise
 from ident.link_sensor import LinkDelay, comparable_links, find_link_delays, with_link_encoders
 from ident.model import Effect, Model
 from ident.parallel import Workers
 from ident.problem import data_count, data_counts, predictions
+from ident.refits import polish
 from ident.seek import Sought, by_link_encoders, gone_on_with, seek
 from ident.weights import make_weights
 from sim.effects import parse_effect
@@ -200,3 +204,38 @@ def test_a_search_by_link_encoders_goes_on_in_the_time_that_is_left(monkeypatch)
     assert gone_on_with(ended, 4, Workers()).result == ("both", "first", "causes")
     assert gone_on_with(replace(ended, late=False), 4, Workers()).result == "causes"
     assert gone_on_with(ended, 4, Workers(deadline=0.0)).result == "causes"
+
+
+def test_what_link_encoders_alone_show_carries_over_to_parts_left_out(ur10, tmp_path):
+    """An error of an encoder once a turn of the joint: the motor follows what it says, which its torque hardly shows."""
+    hidden = parse_effect("encoder_eccentricity@elbow_joint:amplitude=1e-3,phase=0.4", ur10)
+    problem = linked(motions(ur10, 21, [hidden], tmp_path)).problem
+    joint = ur10.joint_names.index("elbow_joint")
+    first = fit_baseline(problem, None)
+    round_disc = next(h for h in catalogue(problem.structure, motions_alone=True) if h.key == hidden_key(hidden))
+    wave = Effect(round_disc, 1e-3 * np.array([np.cos(0.4), np.sin(0.4)]))
+    found = polish(problem, replace(first, model=replace(first.model, effects=(wave,))))
+    assert first.costs[joint] > 10.0 * found.costs[joint]
+    assert carries_over(problem, first, found, joint, Workers())
+    pairs = [
+        tuple(predictions(problem, x.model, x.remainders)[i] for x in (first, found))
+        for i in range(len(problem.groups))
+    ]
+    errors = link_errors(problem, pairs)
+    at = problem.groups[0].links.index(joint)
+    assert np.all(errors.before[:, at] > 10.0 * errors.noise[:, at])
+    assert np.mean(errors.noise[:, at]) < np.mean(errors.after[:, at]) < 1e-3 * np.mean(errors.before[:, at])
+    # Given up, that is noise of the joint's link encoder, and of no other.
+    loud = with_error_as_noise(problem, first, joint).groups[0].link_std / problem.groups[0].link_std
+    assert loud[joint] > 3.0 and np.all(np.delete(loud, joint) == 1.0)
+
+
+def hidden_key(effect):
+    return effect.name, effect.place
+
+
+def test_a_joint_that_was_given_up_ends_the_search_where_it_still_leaves_most():
+    """It had been given up again and again until the time was over."""
+    laws = tuple(SimpleNamespace(joint=j) for j in (0, 0, 1))
+    search = Search(None, None, laws[2:], 0.0)
+    assert elsewhere(search, 0).over

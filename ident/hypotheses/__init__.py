@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,9 +20,10 @@ from ident.hypotheses import (
     structure,
     transmission,
 )
-from ident.hypotheses.hypothesis import Hypothesis, Parameter, Screen, SignalScale
-from robot_assets.robot import linear_joints
+from ident.hypotheses.hypothesis import RIPPLE, Hypothesis, Parameter, Screen, SignalScale
+from robot_assets.robot import Robot, linear_joints
 
+MOST_IN_A_TURN = 4  # periods of a usual ripple in a turn of its motor
 AT_ORIGIN = 1e-4  # m, from the base's origin
 LEAST_DAMPING = 1e-6  # s, of a gear, over its stiffness
 SHARPER = (  # with a parameter that motions do not show
@@ -118,7 +120,21 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
     if robot.n > 1 and np.any(robot.gravity):  # of a single joint it is a body whose centre is elsewhere
         out.append(structure.leaning_base())
     out += [hinges.compliance("base", -1, axes, "base_elasticity") for axes in _turned(np.eye(3))]
-    return tuple(out)
+    return tuple(_turning_with_motor(h, robot) for h in out)
+
+
+def _turning_with_motor(hypothesis: Hypothesis, robot: Robot) -> Hypothesis:
+    """A ripple, which is usually of what turns with the motor: a few times in each turn of it."""
+    if not hypothesis.repeats or hypothesis.joint < 0:
+        return hypothesis
+    turns = robot.joints[hypothesis.joint].gear_ratio
+    at = [q.name for q in hypothesis.parameters].index(RIPPLE)
+
+    def usual(p: np.ndarray) -> dict[str, float]:
+        times = round(p[at] / turns)
+        return {RIPPLE: times * turns} if 1 <= times <= MOST_IN_A_TURN else {}
+
+    return replace(hypothesis, options=hypothesis.options | {"usual": usual})
 
 
 def wider_forms(hypothesis: Hypothesis, leads: bool = True) -> list[Hypothesis]:

@@ -162,6 +162,7 @@ class Hypothesis:
             parameters of another size that do
             about the same. ``dry``: a friction that at rest balances what is asked of it; ``sees_load``: of a size that
             the torque of the gear says.
+            ``usual(p)``: values by name of the parameter that need no data to be expected, next to those that it has.
             ``nats(p)``: log odds before the data, where there is a reason for any. ``of_size(p)``: factor of the spreads
             that are expected of its parameters. ``body``: the link whose inertia it
             changes.
