@@ -189,7 +189,16 @@ def cause_remains(found: Findings, refuted: bool) -> bool:
     much = chi2 > LEFT_ERROR or (chi2 > LEFT_NOISE and found.left > LEFT_SHARE)
     named = named_effects(found.final)
     false = bool(found.belied) or bool(no_loads(found))
-    return found.result.detected and (refuted or much or false or not named)
+    nothing_else = not named and not of_steps(found)
+    return found.result.detected and (refuted or much or false or nothing_else)
+
+
+def of_steps(found: Findings) -> bool:
+    """Whether all that was found lies within the noise as a whole, at joints whose encoders come in steps: noise of
+    steps is not quite as it is taken."""
+    stepped = {x.joint for x in found.setup.steps}
+    at = {x.candidates[0].hypothesis.joint for x in found.result.rounds}
+    return not found.result.clear and bool(at) and at <= stepped
 
 
 def no_loads(found: Findings) -> list[Effect]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, less_errors_of_laws
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
-from ident.conclude import Findings, _cause, _drifting_friction, conclude
+from ident.conclude import Findings, _cause, _drifting_friction, cause_remains, conclude
 from ident.contests import alike, best_of_each, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
@@ -48,6 +48,7 @@ from ident.parallel import Workers
 from ident.posture import moved_by_gears
 from ident.problem import Weights, data_counts, predictions
 from ident.pruning import plainly_special, pruned, renamed, without_shadows
+from ident.quantization import Steps
 from ident.refits import polish, refit, reweighted, settled, to_compete, turned, under_own_noise
 from ident.reporting import evidence_plot, frf_views, most_affected
 from ident.rounds import (
@@ -1395,6 +1396,29 @@ def test_a_round_that_is_renamed_loses_no_probability(named):
     again = renamed(rounds, before, after)
     assert [[c.hypothesis for c in r.candidates] for r in again] == [[rub, rub, late], [late, late, rub]]
     assert [[c.probability for c in r.candidates] for r in again] == [[0.6, 0.3, 0.1]] * 2
+
+
+@pytest.mark.parametrize(
+    ("clear", "joint", "stepped", "remains"),
+    [(False, 2, {2}, False), (False, 1, {2}, True), (True, 2, {2}, True), (False, 2, set(), True)],
+)
+def test_what_steps_of_an_encoder_leave_within_the_noise_is_no_unknown_cause(
+    named, monkeypatch, clear, joint, stepped, remains
+):
+    """Noise of rounding is not quite as it is taken; a decoy had followed what that lacks, of which nothing was left."""
+    monkeypatch.setattr("ident.conclude.named_effects", lambda fit: ())
+    monkeypatch.setattr("ident.conclude.no_loads", lambda found: [])
+    decoy = replace(named["coulomb_friction", "elbow_joint"], effect="unknown:drift", joint=joint)
+    rounds = (SimpleNamespace(candidates=(Candidate(decoy, None, 0.0, 1.0),)),)
+    found = SimpleNamespace(
+        final=SimpleNamespace(chi2_per_dof=0.99),
+        left=0.0,
+        belied=(),
+        result=SimpleNamespace(detected=True, clear=clear, rounds=rounds),
+        setup=SimpleNamespace(steps=tuple(Steps(j, 1e-4, 1e-9) for j in stepped)),
+    )
+    assert cause_remains(found, False) == remains
+    assert cause_remains(found, True)
 
 
 @pytest.mark.slow
