@@ -205,6 +205,8 @@ def fit(
         H, b = normal_equations(problem, columns, at.predictions, weights)
         if not share_known:
             share = trusted_share(H, shared_information(problem, at.model, at.predictions, weights))
+            if share < 1.0 and any(e.hypothesis.gear_law for e in model.effects):
+                share = 0.0  # what noise adds is told as of linear gears, and is more than there can be
             criterion, share_known = replace(criterion, share=share), True
             at = settled = replace(at, noise=criterion.noise(at.predictions))
         step, damping = descend(criterion, at, H, b, damping, anew or fine)

@@ -226,3 +226,15 @@ def test_an_encoder_passes_on_the_noise_that_its_law_is_not_shown(identified, la
     found = whole.outputs() - silent.outputs()
     assert np.abs(found - expected)[:, hidden].max() < 0.02 * np.abs(expected[:, hidden]).max()
     assert np.abs(found[:, ~hidden]).max() < 0.02 * np.abs(found[:, hidden]).max()
+
+
+@pytest.mark.parametrize(("told", "taken"), [(1.0, 1.0), (0.7, 0.0)])
+def test_of_gears_with_laws_noise_is_taken_off_as_a_whole_or_not_at_all(identified, monkeypatch, told, taken):
+    """It is told as of linear ones: where it is more than there can be a gear that hardens much had ended 2 % off, with
+    a twentieth of its deviation."""
+    _, setup, best = identified
+    gear = next(h for h in catalogue(setup.problem.structure) if h.key == ("hardening_stiffness", "elbow_joint"))
+    monkeypatch.setattr("ident.torque_fit.trusted_share", lambda *args: told)
+    hard = replace(best.model, effects=(Effect(gear, np.array([1e6])),))
+    shares = [fit(setup.problem, m, iterations=1, remainders=best.remainders).share for m in (best.model, hard)]
+    assert shares == [told, taken]
