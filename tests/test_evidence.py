@@ -1698,6 +1698,8 @@ def test_a_ripple_once_or_twice_in_a_turn_of_the_motor_is_not_charged_for_its_pe
     for times in (1.0, 2.0):
         assert charge(times * turns * (1.0 + 1e-5)) - charge(1.37 * turns) > 3.0
     assert max(charge(x * turns) for x in (0.3, 1.37, 9.0)) < -5.0
+    bench = catalogue(build_structure(load_robot("twomass")))  # without a gear
+    assert not any("usual" in x.options for x in bench) and "usual" in h.options
 
 
 @pytest.mark.parametrize(("value", "spread"), [(0.97, -np.log(0.97)), (1.03, np.log(1.03)), (4.9, LOG_SPREAD)])

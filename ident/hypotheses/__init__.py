@@ -124,10 +124,11 @@ def catalogue(chain: Structure, *, motions_alone: bool = False, held: bool = Tru
 
 
 def _turning_with_motor(hypothesis: Hypothesis, robot: Robot) -> Hypothesis:
-    """A ripple, which is usually of what turns with the motor: a few times in each turn of it."""
-    if not hypothesis.repeats or hypothesis.joint < 0:
-        return hypothesis
+    """A ripple, which is usually of what turns with the motor: a few times in each turn of it. Without a gear that would
+    be what slow laws of the position look like too."""
     turns = robot.joints[hypothesis.joint].gear_ratio
+    if not hypothesis.repeats or hypothesis.joint < 0 or turns == 1.0:
+        return hypothesis
     at = [q.name for q in hypothesis.parameters].index(RIPPLE)
 
     def usual(p: np.ndarray) -> dict[str, float]:
