@@ -165,8 +165,8 @@ def occam(candidate: Candidate, temper: float) -> float:
     ``-log det(1 + P L / temper) / 2`` with the spread ``P`` of its parameters before the data and their
     information ``L`` with all other coordinates free (Laplace's approximation: MacKay, Neural Comput. 4,
     1992), and the density of the values themselves where there is a prior. A parameter that the data do
-    not determine costs nothing, and one at a value that is usual no more than one that is absent. One that they find absent costs what they lose without it, and more where it is what
-    makes the effect.
+    not determine costs nothing, and one at a value that is usual no more than one that is absent. One that they find
+    absent costs what they lose without it, and more where it is what makes the effect.
     """
     effect = candidate.fit.model.effects[-1]
     ps = effect.hypothesis.parameters

@@ -60,8 +60,8 @@ def estimate_frf(
         amplitude: level; of each point its highest where None.
 
     Raises:
-        DataError: where the dataset breaks the format, nothing was recorded at that level, a point has fewer than n experiments or
-            experiments that do not excite every input, or JIO has no reference.
+        DataError: where the dataset breaks the format, nothing was recorded at that level, a point has fewer than n
+            experiments or experiments that do not excite every input, or JIO has no reference.
     """
     if estimator not in ESTIMATORS + LOCAL:
         raise DataError("estimator", "estimate_frf", repr(estimator), f"one of {ESTIMATORS + LOCAL}")

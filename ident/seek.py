@@ -252,8 +252,7 @@ def by_link_encoders(dataset: Dataset, setup: Setup, baseline: Fit, max_causes: 
         for groups in (wide.problem.groups, wide.held_out)
     )
     both = with_link_encoders(replace(wide.problem, groups=recorded), late)
-    both = replace(both, q_std=told.q_std, tau_std=told.tau_std, noise_denied=told.noise_denied)
-    both = replace(both, sampling=told.sampling)
+    both = replace(both, q_std=told.q_std, tau_std=told.tau_std, noise_denied=told.noise_denied, sampling=told.sampling)
     wide = replace(wide, problem=both, held_out=held_out)
     half = workers.for_half()
     try:

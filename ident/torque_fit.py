@@ -195,7 +195,8 @@ def fit(
     at = settled = Point(model, pack(model), found, [p.solution.W for p in found], cost)
     share_known = not has_scatter(problem, model)  # then nothing is taken off
     anew, moves, drift = needs_remainders(problem, model), moves_links(model), np.zeros(len(at.x))
-    exact = exact and not problem.motions_alone and any(e.hypothesis.gear_law for e in model.effects)
+    laws = any(e.hypothesis.gear_law for e in model.effects)
+    exact = exact and not problem.motions_alone and laws
     fine = converged = False  # fine: whether the steps are by exact derivatives already
     damping, slow, last = DAMPING, is_slow(model), 0.0
     columns: list[Columns] = []
@@ -205,7 +206,7 @@ def fit(
         H, b = normal_equations(problem, columns, at.predictions, weights)
         if not share_known:
             share = trusted_share(H, shared_information(problem, at.model, at.predictions, weights))
-            if share < 1.0 and any(e.hypothesis.gear_law for e in model.effects):
+            if share < 1.0 and laws:
                 share = 0.0  # what noise adds is told as of linear gears, and is more than there can be
             criterion, share_known = replace(criterion, share=share), True
             at = settled = replace(at, noise=criterion.noise(at.predictions))

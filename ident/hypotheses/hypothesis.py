@@ -78,7 +78,7 @@ class Parameter:
         allowed = self.spread_allowed(value)
         if not self.log or self.null is None or np.isfinite(self.spread):
             return allowed
-        return min(max(abs(self.to_internal(value) - self.to_internal(self.null)), 1e-300), allowed)
+        return min(abs(self.to_internal(value) - self.to_internal(self.null)), allowed)
 
     def spread_allowed(self, value: float) -> float:
         """Standard deviation before the data, fitted coordinates: of the size of the value where nothing is said."""
