@@ -184,3 +184,16 @@ def test_a_map_is_guessed_for_files_with_clocks_of_their_own(tmp_path):
         assert np.allclose(q[:, j], angle(t + j), atol=2e-3) and np.allclose(
             tau[50:-50, j], 50 * torque(t + j)[50:-50], atol=1e-2
         )
+
+
+@pytest.mark.parametrize("files", [1, 2])
+def test_the_order_of_stamps_is_looked_at_once(tmp_path, monkeypatch, files):
+    looked = []
+    for module in ("ident.convert", "ident.convert.clock", "ident.convert.joining"):
+        monkeypatch.setattr(f"{module}.check_order", lambda t, path: looked.append(path), raising=False)
+    t = np.arange(1000) / 100
+    logs = [written(tmp_path / f"{n}.csv", t=t, u=torque(t), x=angle(t)) for n in "ab"[:files]]
+    several = '[files]\na = "a.csv"\nb = "b.csv"\n' + CLOCK + BENCH.replace('"u', '"a:u').replace('"x', '"b:x')
+    (tmp_path / "map.toml").write_text("sample_rate = 100.0\n" + (several if files == 2 else CLOCK + BENCH))
+    convert_logs(logs, "twomass", tmp_path / "map.toml")
+    assert looked == logs

@@ -91,13 +91,14 @@ def check_order(t: np.ndarray, path: Path) -> None:
 def check_stamps(t: np.ndarray, rate: float, path: Path, signals: Sequence[np.ndarray] = ()) -> Stamps:
     """Stamps (N,), s, for a dataset of ``rate`` Hz; even times where they are those, rounded.
 
+    They have passed ``check_order``.
+
     Args:
         signals: (N, k) each, that tell whether the rows are even.
 
     Raises:
-        DataError: where they are not finite, go back, have a gap too long to be filled, or are in another unit.
+        DataError: where they have a gap too long to be filled, or are in another unit.
     """
-    check_order(t, path)
     even = even_rows(t, signals, 1 / rate)
     t = t if even is None else even.t
     step = np.diff(t)

@@ -7,7 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ident.convert.clock import Stamps, at_times, changed, check_stamps, resample, stamp_seconds, uniform_times
+from ident.convert.clock import (
+    Stamps,
+    at_times,
+    changed,
+    check_order,
+    check_stamps,
+    resample,
+    stamp_seconds,
+    uniform_times,
+)
 from ident.convert.mapping import LogMap
 from ident.format_checks import SHORTEST
 from robot_assets.errors import DataError
@@ -39,6 +48,7 @@ def on_one_clock(
         # Numbers may be of several units, and count from one origin.
         s = stamp_seconds(x, 1.0, origin) if dates else x * f.time_factor - origin * m.files[0].time_factor
         rows = list(own[f.prefix].values())
+        check_order(s, paths[f.prefix])
         clocks[f.prefix] = clock = check_stamps(s + f.shift, m.sample_rate, paths[f.prefix], rows)
         if clock.rounded:
             say(f"{paths[f.prefix].name}: {clock.told()}")
