@@ -12,6 +12,7 @@ from ident.dataset import Dataset
 from ident.distortion import estimate_distortion
 from ident.frf import estimate_frf
 from ident.outputs import outputs_into
+from ident.units import units_of_torques
 
 
 def write_frf(dataset: Dataset, out: str | Path, estimator: str = "auto") -> dict[str, Any]:
@@ -42,6 +43,7 @@ def write_frf(dataset: Dataset, out: str | Path, estimator: str = "auto") -> dic
             }
             for kind in ("excited", "noise", "even", "odd")
         },
+        "distortion_unit": units_of_torques(dataset.robot),  # of a linear joint N, whatever the key above says
     }
     with outputs_into(out) as folder:
         np.savez_compressed(

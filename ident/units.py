@@ -69,7 +69,8 @@ def torque_units(robot: Robot) -> tuple[str, ...]:
 
 def response_unit(robot: Robot) -> str:
     """Unit of frequency responses from torque to acceleration over all joints."""
-    return "(m/s²)/N" if torque_unit(robot) == "N" else "(rad/s²)/(N m)"
+    one_kind = {"N": "(m/s²)/N", "N m": "(rad/s²)/(N m)"}
+    return one_kind.get(torque_unit(robot), "(rad/s² or m/s²)/(N m or N)")
 
 
 def torque_unit(robot: Robot, joints: Collection[str] = ()) -> str:

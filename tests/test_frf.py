@@ -1,5 +1,6 @@
 """FRF averages on synthetic closed loops: bias, covariance, levels, distortion."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ from ident.dataset import Dataset, Segment
 from ident.distortion import estimate_distortion
 from ident.frf import Blocks, _covariance, average, estimate_frf, experiment_sets
 from ident.frf_basis import frf_levels
+from ident.frf_output import write_frf
+from ident.units import response_unit
 from robot_assets.errors import DataError
 
 
@@ -224,6 +227,16 @@ def test_points_of_other_periods_and_levels_share_their_frequencies(ur10):
     levels = estimate_distortion(data, frf)
     assert levels.levels == (1.0, 0.5) and np.isnan(levels.excited[1, 0]).all()
     assert levels.excited[1, 1] == pytest.approx(levels.excited[0, 1], rel=0.2)
+
+
+def test_levels_of_linear_joints_are_told_in_newtons(ur10, tmp_path, monkeypatch):
+    data, _ = recorded(ur10, 2)
+    monkeypatch.setattr("ident.units.linear_joints", lambda robot: np.array([False, True]))
+    summary = write_frf(data, tmp_path / "frf")
+    assert summary == json.loads((tmp_path / "frf" / "frf.json").read_text())
+    assert summary["distortion_unit"] == dict(zip(data.joints, ("N m", "N"), strict=True))
+    assert list(summary["distortion_N_m"]["odd"]) == list(data.joints)
+    assert response_unit(data.robot) == "(rad/s² or m/s²)/(N m or N)"
 
 
 def test_points_without_a_common_frequency_are_refused(ur10):
