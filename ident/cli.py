@@ -443,6 +443,9 @@ def convert(
     guess: Annotated[
         bool, typer.Option("--guess", help="Write a first map to edit, from names, shapes and ranges.")
     ] = False,
+    encoding: Annotated[
+        str, typer.Option(help="Of text logs, with --guess, which writes it into the map: where names are no UTF-8.")
+    ] = "",
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -451,7 +454,9 @@ def convert(
     from ident.dataset_io import check_target, save_dataset
 
     if guess:
-        return _guess(files, robot, map_, json_, quiet)
+        return _guess(files, robot, map_, encoding, json_, quiet)
+    if encoding:
+        raise DataError("--encoding", "command line", "no --guess", f'encoding = "{encoding}" in the map')
     if out is None:
         raise DataError("--out", "command line", "no such option", "where to write the dataset, or --guess")
     check_target(out)
@@ -471,13 +476,15 @@ def _soon_read(files: list[Path]) -> bool:
     return sum(f.stat().st_size for f in files if exists(f)) < LARGE_LOG
 
 
-def _guess(files: list[Path], robot: str, out: Path, json_: bool, quiet: bool) -> None:
+def _guess(files: list[Path], robot: str, out: Path, encoding: str, json_: bool, quiet: bool) -> None:
+    from ident.convert.encoding import known_encoding
     from ident.convert.guess import guess_map
 
+    stated = known_encoding(encoding, "--encoding", "command line") if encoding else ""
     if out.exists():
         raise DataError("--map", str(out), "a file that is there already", "a new file: --guess overwrites no map")
     with _progress(quiet or json_ or _soon_read(files)) as (say, _):
-        guessed = guess_map(files, robot, progress=say)
+        guessed = guess_map(files, robot, encoding=stated, progress=say)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         beside = out.with_name(f".{out.name}.part")

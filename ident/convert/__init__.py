@@ -142,13 +142,15 @@ def _tell_guessed_ratios(m: LogMap, arm: Robot, say: Callable[[str], None]) -> N
 
 def _read(paths: dict[str, Path], m: LogMap) -> dict[str, np.ndarray]:
     if not m.files:
-        return read_log(paths[""], m.sources, {m.time} if m.time else frozenset())
+        return read_log(paths[""], m.sources, {m.time} if m.time else frozenset(), m.encoding)
     data = {}
     for part in m.files:
         start = f"{part.prefix}:"
         wanted = {s.removeprefix(start) for s in m.sources if s.startswith(start)}
         times = {part.time or (m.time or "").removeprefix(start)}
-        for key, x in (read_log(paths[part.prefix], wanted, times) if wanted else {}).items():
+        for key, x in (
+            read_log(paths[part.prefix], wanted, times, part.encoding or m.encoding) if wanted else {}
+        ).items():
             if part.width is not None and key != part.time:
                 if x.size % part.width:
                     raise DataError(
@@ -190,7 +192,7 @@ def _segments(name: str, paths: dict[str, Path], m: LogMap, n: int, say: Callabl
             if len(other) != N:
                 raise DataError(source, str(path), f"{len(other)} values", f"one for each of {N} samples")
             seconds = seconds + stamp_seconds(other, factor, other[0])
-        check_order(seconds, path)
+        check_order(seconds, path)  # before what it would look like: rows of several joints
         check_rows(seconds, channels["q"], path)
         clock = check_stamps(seconds, m.sample_rate, path, [v for k, v in channels.items() if k != "q_link"])
         if clock.rounded:

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ident.convert.dates import DATE, date_order, day_and_month_swapped, is_date, parse_dates
+from ident.convert.numerals import plain_numbers
 from robot_assets.errors import DataError
 
 NUMBER = r"(?i)^\s*([+-]?(\d+\.?\d*|\.\d+)([ed][+-]?\d+)?|[+-]?inf(inity)?|[+-]?nan|)\s*$"
@@ -46,7 +47,7 @@ class Cells:
         ``decimal``: sign of the decimals of the whole text; empty where that is not plain."""
         self.name, self.path, self.wanted, self.quoted, self.decimal = name, path, wanted, quoted, decimal
         self.kind, self.rows, self.like, self.order = "", 0, "", ("ymd", False)
-        self.comma = self.dot = False
+        self.comma = self.dot = self.typeset = False
         self.fault: tuple[int, str] | None = None
         self.labels: tuple[str, ...] = ()
         self._parts: list[np.ndarray] = []
@@ -66,7 +67,7 @@ class Cells:
             self.order = date_order(column) if self.kind == "dates" else self.order
         if self.kind != "texts":
             try:
-                part = self._dates(column) if self.kind == "dates" else self._numbers(column)
+                part = self._dates(column) if self.kind == "dates" else self._any_numbers(column)
                 self._parts.append(part)
             except (pa.ArrowInvalid, ValueError):
                 self._refuse(column)
@@ -106,6 +107,17 @@ class Cells:
         if order[1] and written:
             self._above = _text(column.drop_null()[-1])
         return parse_dates(column, self.like, self.order)
+
+    def _any_numbers(self, column: pa.Array) -> np.ndarray:
+        """Numbers, typeset ones too: these are asked for where the first is met, as it takes time."""
+        if not self.typeset:
+            try:
+                return self._numbers(column)
+            except (pa.ArrowInvalid, ValueError):
+                if plain_numbers(column) is column:
+                    raise
+                self.typeset = True
+        return self._numbers(plain_numbers(column))
 
     def _numbers(self, column: pa.Array) -> np.ndarray:
         column = self._without_thousands(column) if self.decimal == "," else column
@@ -167,15 +179,15 @@ class Cells:
             if not np.any(bad):
                 bad[self._no_date(column)] = True
         else:
-            plain = column
+            plain = read = plain_numbers(column)
             if self._grouped is not None:
-                grouped = pc.match_substring_regex(column, GROUPED[self.decimal])
-                plain = pc.if_else(grouped, pc.replace_substring(column, OTHER[self.decimal], ""), column)
+                grouped = pc.match_substring_regex(read, GROUPED[self.decimal])
+                plain = pc.if_else(grouped, pc.replace_substring(read, OTHER[self.decimal], ""), read)
             if self.comma or (not self.dot and not self.quoted):
                 plain = pc.replace_substring(plain, ",", ".")
             bad = ~pc.match_substring_regex(plain, NUMBER).fill_null(True).to_numpy(zero_copy_only=False)
             if self._grouped is not None and not np.any(bad):
-                bad = pc.match_substring(column, OTHER[self.decimal]).fill_null(False).to_numpy(zero_copy_only=False)
+                bad = pc.match_substring(read, OTHER[self.decimal]).fill_null(False).to_numpy(zero_copy_only=False)
                 bad &= ~grouped.fill_null(True).to_numpy(zero_copy_only=False)
         index = int(np.argmax(bad))
         row, text = self.rows + index + 1, _text(column[index]).strip()
@@ -203,7 +215,10 @@ class Cells:
             raise DataError(
                 "signal", str(self.path), f"the header again in row {row}", "one log: cut the file in two there"
             )
-        raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", "numbers")
+        lost = (
+            ", and the encoding of the log where it is none of UTF-8 (encoding in the map)" if "\ufffd" in text else ""
+        )
+        raise DataError("signal", str(self.path), f"{self.name} = {text[:60]!r} in row {row}", f"numbers{lost}")
 
     def _no_date(self, column: pa.Array) -> int:
         """The first that is written as a date, but is none of the calendar: the first half with one, halved again."""

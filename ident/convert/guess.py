@@ -18,7 +18,7 @@ from ident.convert.guess_order import joint_column
 from ident.convert.guess_text import Guess, plain, render
 from ident.convert.guess_time import FoundTime, find_time, is_time
 from ident.convert.guess_units import Family, guess_scales, unwrapped
-from ident.convert.reading import Survey, survey_log
+from ident.convert.reading import Survey, is_text, survey_log
 from ident.convert.spelling import split_unit
 from robot_assets.errors import DataError
 from robot_assets.robot import Robot, linear_joints, load_robot
@@ -43,11 +43,12 @@ class GuessedMap:
 
 
 def guess_map(
-    files: Sequence[Path], robot: str | Path, *, progress: Callable[[str], None] = lambda text: None
+    files: Sequence[Path], robot: str | Path, *, encoding: str = "", progress: Callable[[str], None] = lambda text: None
 ) -> GuessedMap:
     """Guess the map of one or more logs of a robot.
 
     Args:
+        encoding: of texts; empty where they tell it themselves.
         progress: told in words what is being done.
 
     Raises:
@@ -60,10 +61,11 @@ def guess_map(
     surveys = []
     for path in paths:
         progress(f"reading {path.name}")
-        surveys.append(survey_log(path))
+        surveys.append(survey_log(path, encoding))
     progress("guessing the map")
     log = read_together(paths, surveys, arm)
-    families = families_of(log.long_signals(), log.units, arm, log.lists, log.unread)
+    signals = log.long_signals() if log.parts else _one_time(log.long_signals())
+    families = families_of(signals, log.units, arm, log.lists, log.unread)
     if log.clocks:
         time = FoundTime(rate=min(c.rate for c in log.clocks.values()))
     else:
@@ -89,11 +91,31 @@ def guess_map(
             families=families,
             linear=linear,
             doubts=log.doubts,
+            encoding=_common_encoding(paths, surveys),
         )
     )
     found = {c: ", ".join((f.name, *scales[c].options)) for c, f in chosen.items()} | _found_time(log, time)
     missing = tuple(c for c in ("tau", "q") if c not in chosen)
     return GuessedMap(text, found, missing, tuple(_warnings(log, time, chosen, missing)))
+
+
+def _one_time(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Signals of one file without repetitions of a time: structures of MATLAB have one each."""
+    times: list[np.ndarray] = []
+    out = {}
+    for name, x in signals.items():
+        if is_time(name):
+            if any(np.array_equal(x.ravel(), t) for t in times):
+                continue
+            times.append(x.ravel())
+        out[name] = x
+    return out
+
+
+def _common_encoding(paths: Sequence[Path], surveys: Sequence[Survey]) -> str:
+    """The encoding of all texts; empty where they have several, each of which its file tells."""
+    found = {s.encoding for path, s in zip(paths, surveys, strict=True) if is_text(path)}
+    return found.pop() if len(found) == 1 else ""
 
 
 def _unlike_a_log(path: Path, survey: Survey, families: Sequence[Family], time: FoundTime, arm: Robot) -> DataError:

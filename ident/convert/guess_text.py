@@ -46,6 +46,7 @@ class Guess:
         chosen: channel -> signals taken for it; others: that might also be it; scales: their units, by channel.
         families: all signals. linear: (n,) joints that are.
         doubts: name of a signal -> what is doubtful about how it was read.
+        encoding: of texts, where it is not UTF-8.
     """
 
     paths: Sequence[Path]
@@ -59,6 +60,7 @@ class Guess:
     families: Sequence[Family]
     linear: np.ndarray
     doubts: Mapping[str, str]
+    encoding: str = ""
 
 
 def render(guess: Guess) -> str:
@@ -72,6 +74,8 @@ def _head(guess: Guess) -> Iterator[str]:
     yield "# above all those marked EDIT. Result: tau in N m (N), q in rad (m), both on the link side of the gear."
     yield f"sample_rate = {guess.time.rate or 1000.0!r}" + _rate_note(guess.time, bool(guess.clocks))
     yield 'input_hold = "none"      # "zoh" where the torque is held over a sample'
+    if guess.encoding:
+        yield f"encoding = {quoted(guess.encoding)}"
     if len(guess.paths) == 1 or guess.parts:
         yield "split = 0.7              # the first 70 % identify, the rest validates"
         return

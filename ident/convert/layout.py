@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import csv
 import itertools
 import re
@@ -13,6 +12,8 @@ from functools import cache
 from pathlib import Path
 
 from ident.convert.dates import is_date
+from ident.convert.encoding import encoding_of
+from ident.convert.numerals import SPACES, plain_number
 from ident.convert.spelling import unit_of
 from robot_assets.errors import DataError
 
@@ -25,8 +26,10 @@ BRACKETED = re.compile(r"\[(.+?)\]")
 # A number with decimals, and the sign before them; and one whose sign may as well stand between thousands.
 DECIMALS = re.compile(r"(?i)[+-]?(?:\d*([.,])\d+|\d+(?:[.,]\d{3})+([.,])\d*)(?:[ed][+-]?\d+)?$")
 THREE = re.compile(r"[+-]?[1-9]\d{0,2}([.,])\d{3}(?:\1\d{3})*$")
+QUOTED = re.compile(r'(?:^|[,;\t])[ ]*"')
+WORD = re.compile(rf"\"([^\"]*)\"|'([^']*)'|((?:\S|[{SPACES}])+)")  # what stands between digits parts no words
 NONE = ("na", "n/a", "#n/a", "null")
-ENCODING_BYTES = 1 << 16  # of a text that say how it is encoded
+MOST_BROKEN = 20  # lines of one row, whose cells in quotes have breaks
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,8 @@ class Layout:
     """How a text is laid out.
 
     Attributes:
-        encoding: of Python. delimiter: one character, or None for blanks.
+        encoding: of Python; Latin-1, which keeps all bytes, where ``unsure``: they do not tell it.
+        delimiter: one character, or None for blanks.
         names: of the columns; empty where no line says them. units: as written below the names, or empty.
         start: lines before the first row. columns: of a row.
         decimal: sign of the decimals, "." or ","; empty where the first rows have both, or none that is plain.
@@ -47,15 +51,20 @@ class Layout:
     start: int
     columns: int
     decimal: str = ""
+    unsure: bool = False
 
 
-def read_layout(path: Path) -> Layout:
+def read_layout(path: Path, encoding: str = "") -> Layout:
     """Look at the first lines of a text.
 
+    Args:
+        encoding: as it is stated; empty where it is not.
+
     Raises:
-        DataError: where a line is too long for a table.
+        DataError: where a line is too long for a table, or the text is none of the encoding.
     """
-    encoding = _encoding(path)
+    told = encoding_of(path, encoding)
+    encoding, unsure = told or "latin-1", not told
     comments: deque[str] = deque(maxlen=2)
     skipped, looked_at = 0, 0
     with path.open(encoding=encoding, errors="replace", newline=None) as file:
@@ -72,18 +81,20 @@ def read_layout(path: Path) -> Layout:
     rows = [r for r in rows if r]
     if any(len(r) >= LONGEST_LINE for r in (*comments, *rows)):
         raise DataError("log", str(path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
+    rows = _whole_rows(rows)
+    lines = list(itertools.accumulate((r.count("\n") for r in rows), initial=skipped))  # before each row
     pairs = _pairs(rows)
     if pairs is not None:
         names, units, start = pairs
         decimal = _decimal(w for r in rows[start:] for w in _words(r, "\t"))
-        return Layout(encoding, "\t", names, units, skipped + start, len(names), decimal)
+        return Layout(encoding, "\t", names, units, lines[start], len(names), decimal, unsure)
     above = _header(rows)
     comments.extend(r for r in rows[:above] if _comment(r))
-    rows, skipped = rows[above:], skipped + above
+    rows = rows[above:]
     first = rows[0] if rows else ""
     delimiter = _delimiter(first, rows[1] if len(rows) > 1 else first)
     words = _words(first, delimiter)
-    names, units, start = words, (), skipped
+    names, units, start = words, (), 0
     # A header may be a comment itself: "# t q tau", above "# s rad Nm"; its row may hold texts, "%time,name,q" those of
     # ROS.
     said = [
@@ -99,11 +110,36 @@ def read_layout(path: Path) -> Layout:
         units = below if len(below) == len(words) and _units(below) and _units_above(below, first_row) else ()
         start += 1 + bool(units)
     columns = len(words)
-    written = [w for r in rows[start - skipped :][:-1] if not _comment(r) and any(w := _words(r, delimiter))]
+    written = [w for r in rows[start:][:-1] if not _comment(r) and any(w := _words(r, delimiter))]
     if names and written and all(_as_many(len(names), w) for w in written):
         columns = len(written[0])  # a delimiter may stand at the end of rows, or of the header, alone
         names = (*names, "")[:columns]
-    return Layout(encoding, delimiter, names, units, start, columns, _decimal(w for row in written for w in row))
+    begins = lines[min(above + start, len(lines) - 1)]
+    decimal = _decimal(w for row in written for w in row)
+    return Layout(encoding, delimiter, names, units, begins, columns, decimal, unsure)
+
+
+def _whole_rows(lines: list[str]) -> list[str]:
+    """Rows of lines: a cell in quotes may hold breaks. One that does not end stands by itself, as such quotes are none;
+    one that is cut at the last line is left out."""
+    out, k = [], 0
+    while k < len(lines):
+        end, row = k + 1, lines[k]
+        if _open(row):
+            while end < min(k + MOST_BROKEN, len(lines)) and _open(row):
+                row, end = row + lines[end], end + 1
+            if _open(row):
+                if end == len(lines) and k:
+                    break
+                end, row = k + 1, lines[k]
+        out.append(row)
+        k = end
+    return out
+
+
+def _open(row: str) -> bool:
+    """Whether a row ends within a cell in quotes."""
+    return row.count('"') % 2 == 1 and not _comment(row) and QUOTED.search(row) is not None
 
 
 def _header(rows: list[str]) -> int:
@@ -154,25 +190,8 @@ def _as_many(n: int, words: tuple[str, ...]) -> bool:
 
 def _decimal(words: Iterable[str]) -> str:
     """The only sign behind which decimals stand for sure in words: no three digits that may be thousands do."""
-    found = {m[1] or m[2] for w in words if (m := DECIMALS.match(w)) and not THREE.match(w)}
+    found = {m[1] or m[2] for w in map(plain_number, words) if (m := DECIMALS.match(w)) and not THREE.match(w)}
     return found.pop() if len(found) == 1 else ""
-
-
-def _encoding(path: Path) -> str:
-    """Of a text: UTF-16 by its mark, else UTF-8, or Latin-1 where it is none."""
-    with path.open("rb") as file:
-        head = file.read(ENCODING_BYTES)
-    if head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-        return "utf-16"
-    for start, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):  # without a mark: every other byte of a table is zero
-        half = head[start::2]
-        if len(half) > 8 and half.count(0) > 0.9 * len(half):
-            return encoding
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(head)
-    except UnicodeDecodeError:
-        return "latin-1"
-    return "utf-8-sig"
 
 
 def _comment(line: str) -> bool:
@@ -188,14 +207,14 @@ def _delimiter(first: str, second: str) -> str | None:
     if there:
         # A name may hold a comma, in the quotes that spreadsheets put about it, and so may numbers without names.
         return max(there, key=lambda c: (len(_words(first, c)) == len(_words(second, c)), c != ",", first.count(c)))
-    return None if second.split()[1:] or first.split()[1:] else ","
+    return None if _words(second, None)[1:] or _words(first, None)[1:] else ","
 
 
 def _words(line: str, delimiter: str | None) -> tuple[str, ...]:
-    """Of one line, without quotes; a comment that is a header loses its sign."""
-    line = line.strip(" \r\n") if delimiter == "\t" else line.strip()
+    """Of one row, without quotes and breaks; a comment that is a header loses its sign."""
+    line = re.sub(r"\s*\n\s*", " ", line.strip(" \r\n") if delimiter == "\t" else line.strip())
     if delimiter is None:
-        words = [m[1] or m[2] or m[3] or "" for m in re.finditer(r"\"([^\"]*)\"|'([^']*)'|(\S+)", line)]
+        words = [m[1] or m[2] or m[3] or "" for m in WORD.finditer(line)]
     else:
         words = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     return tuple(w.strip().strip("\"'").strip() for w in words)
@@ -209,7 +228,7 @@ def _row(words: tuple[str, ...]) -> bool:
 def _value(word: str) -> bool:
     """Whether a word is a number, a date, or says that there is none."""
     try:
-        float(word.replace(",", ".").lower().replace("d", "e"))  # of Fortran as well
+        float(plain_number(word).replace(",", ".").lower().replace("d", "e"))  # of Fortran as well
     except ValueError:
         return is_date(word) or word.lower() in NONE
     return True

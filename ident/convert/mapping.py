@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ident.convert.encoding import known_encoding
 from ident.convert.quantities import KINDS, is_position, unit_factor, units_of
 from robot_assets.errors import DataError
 from robot_assets.values import choice, exists, instead_of_file, number, read_toml, show, subtable, tables, text, whole
@@ -17,11 +18,11 @@ from robot_assets.values import choice, exists, instead_of_file, number, read_to
 SMALLEST = 1e-15  # a factor that leaves nothing of any signal
 COLUMN = re.compile(r"(tau|q|qd|r|q_ref|q_link|temp)_([1-9][0-9]{0,3})$")
 OPTIONS = {"source", "unit", "sign", "scale", "offset", "gear", "side", "torque_constant", "index", "unwrap", "plus"}
-KEYS = {"sample_rate", "input_hold", "time", "files", "columns", "multisine", "roles", "split"}
+KEYS = {"sample_rate", "input_hold", "encoding", "time", "files", "columns", "multisine", "roles", "split"}
 PLUS_KEYS = {"source", "factor", "index"}
 TIME_KEYS = {"source", "unit", "plus"}
 TIME_PLUS_KEYS = {"source", "unit"}
-FILE_KEYS = {"name", "width", "time", "unit", "shift"}
+FILE_KEYS = {"name", "width", "time", "unit", "shift", "encoding"}
 MULTISINE_KEYS = {"period", "operating_point", "excited_from", "excited_threshold", "excited_lines", "part"}
 PART_KEYS = {"first", "last", "role"}
 TIMES = list(KINDS["time"])
@@ -76,6 +77,7 @@ class FilePart:
         width: values of one sample, where the file has one value a line; else None.
         time: its own time column, without the prefix; None where it has none. time_factor: s per unit of it.
         shift: s, added to its time: clocks may begin apart.
+        encoding: of a text, where it is not that of the whole log.
     """
 
     prefix: str
@@ -84,6 +86,7 @@ class FilePart:
     time: str | None = None
     time_factor: float = 1.0
     shift: float = 0.0
+    encoding: str = ""
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,7 @@ class LogMap:
 
     Attributes:
         sample_rate: Hz, of the dataset. time_factor: s per unit of the time column.
+        encoding: of texts; empty where they tell it themselves.
         time_plus: (source, s per unit) of what is added to it: full seconds with their fraction beside them.
         files: where a log is spread over several; else empty.
         roles: file name or its stem -> role; whole: whether each must be of a file given. split: share of a file
@@ -114,6 +118,7 @@ class LogMap:
     split: float | None
     whole: bool = True
     time_plus: tuple[tuple[str, float], ...] = ()
+    encoding: str = ""
 
     @property
     def sources(self) -> set[str]:
@@ -214,6 +219,7 @@ def read_map(path: str | Path, ratios: np.ndarray, linear: np.ndarray) -> LogMap
         split=number(data, "split", where, low=0.05, high=0.95) if "split" in data else None,
         whole=not shipped,  # of published logs any may be at hand
         time_plus=time_plus,
+        encoding=_encoding(data, "encoding", where),
     )
 
 
@@ -222,6 +228,10 @@ def _known(table: dict, keys: set[str], start: str, where: str) -> None:
     stray = set(table) - keys
     if stray:
         raise DataError(f"{start}{min(stray)}", where, "an unknown key", f"one of {sorted(keys)}")
+
+
+def _encoding(table: dict, key: str, where: str) -> str:
+    return known_encoding(text(table, "encoding", where), key, where) if "encoding" in table else ""
 
 
 def _time_plus(entry: dict, where: str) -> tuple[str, float]:
@@ -255,6 +265,7 @@ def _file(prefix: str, entry: Any, where: str) -> FilePart:
         text(entry, "time", here) if "time" in entry else None,
         unit_factor(entry.get("unit", "s"), TIMES, f"files.{prefix}", where),
         number(entry, "shift", here, default=0.0),
+        _encoding(entry, f"files.{prefix}.encoding", where),
     )
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +16,7 @@ import pyarrow.parquet
 from ident.convert.cells import LABELLED, labels_of
 from ident.convert.dates import as_dates, dates_of_texts, seconds
 from ident.convert.layout import read_layout
-from ident.convert.texts import MOST_CELLS, alike, distinct, read_text, scan_text, text_names, text_units
+from ident.convert.texts import MOST_CELLS, alike, check_names, distinct, read_text, scan_text, text_names
 from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 from robot_assets.values import exists, instead_of_file
@@ -28,6 +28,7 @@ CHANGING = np.array([["a", "b"], ["b", "a"]])  # stands for a list of texts that
 LONGEST_NAME = 200  # characters
 NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
 Signals = dict[str, np.ndarray]
+T = TypeVar("T")
 Reader = Callable[[Path, set[str] | None], dict[str, Any]]
 
 
@@ -43,6 +44,7 @@ class Survey:
         cut: rows that were read of a log that is longer; else 0.
         labels: name -> distinct texts of a column that has few.
         lists: name -> strings of a list of them, which may name columns; empty where it changes from row to row.
+        encoding: of a text, as stated or as its bytes tell; empty of UTF-8 without a mark.
     """
 
     signals: Signals
@@ -52,22 +54,29 @@ class Survey:
     cut: int = 0
     lists: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    encoding: str = ""
 
 
-def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Signals:
+NOTHING_TOLD = Survey({}, {}, frozenset(), {})
+
+
+def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset(), encoding: str = "") -> Signals:
     """The wanted signals of a log; a dot reaches into structures ("rec.act_pos").
 
     Args:
         times: those that may be dates, which come as datetime64 or timedelta64.
+        encoding: of a text, as it is stated; empty where it is not.
 
     Raises:
         DataError: where the file is missing, of another format, unreadable, or lacks a signal.
     """
-    data = _read(path, wanted)
+    text = is_text(path)
+    data = _of(path, lambda p: read_text(p, wanted, encoding) if text else _reader(p)(p, wanted))
     out = {}
     for name in sorted(wanted):
         if name not in data:
-            known = sorted(NAMES.get(path.suffix.lower(), list_signals)(path))
+            suffix = path.suffix.lower()
+            known = sorted(text_names(path, encoding) if text else NAMES.get(suffix, list_signals)(path))
             if name in known:
                 raise DataError("signal", str(path), f"{name} without a number in it", "numbers")
             raise DataError("signal", str(path), f"no {name}", f"one of {known[:30]}")
@@ -78,21 +87,25 @@ def read_log(path: Path, wanted: set[str], times: Set[str] = frozenset()) -> Sig
     return out
 
 
-def survey_log(path: Path) -> Survey:
+def is_text(path: Path) -> bool:
+    """Whether a log is a text, by its suffix."""
+    return READERS.get(path.suffix.lower()) is read_text
+
+
+def survey_log(path: Path, encoding: str = "") -> Survey:
     """All signals of a log that are numbers or dates, single numbers included.
+
+    Args:
+        encoding: as of ``read_log``.
 
     Raises:
         DataError: where the file is missing, of another format or unreadable.
     """
+    found, told = _of(path, lambda p: _surveyed(p, encoding) if is_text(p) else (_reader(p)(p, None), NOTHING_TOLD))
     signals: Signals = {}
     dates, lists = set(), {}
-    doubts: dict[str, str] = {}
-    labels: dict[str, tuple[str, ...]] = {}
-    rows = [0]
-    text = READERS.get(path.suffix.lower()) is read_text
-    for name, value in (
-        _read(path, None, lambda p, _: _surveyed(p, doubts, labels, rows)) if text else _read(path, None)
-    ).items():
+    doubts, labels = dict(told.doubts), dict(told.labels)
+    for name, value in found.items():
         if isinstance(value, np.ndarray) and value.dtype.kind in "OU" and value.ndim == 1:
             labels[name] = labels_of(value[:LABELLED].tolist())
         x = _array(value)
@@ -107,19 +120,19 @@ def survey_log(path: Path) -> Survey:
             stamps = x.ravel()[~np.isnat(x.ravel())]
             x = seconds(x, stamps[0]) if len(stamps) else np.zeros(0)
         signals[name] = x.astype(float)
-    return Survey(signals, text_units(path) if text else {}, frozenset(dates), doubts, rows[0], lists, labels)
+    return replace(told, signals=signals, dates=frozenset(dates), doubts=doubts, lists=lists, labels=labels)
 
 
-def _surveyed(
-    path: Path, doubts: dict[str, str], labels: dict[str, tuple[str, ...]], rows: list[int]
-) -> dict[str, Any]:
-    """Signals of a text, what is doubtful about them, and texts of other columns; rows read of one that is longer."""
-    if not read_layout(path).names:
-        return read_text(path, None)
-    cells = scan_text(path, None)
-    if cells and cells[0].rows * len(cells) > MOST_CELLS:
-        rows[0] = cells[0].rows
-    labels |= {c.name: c.labels for c in cells if c.labels}
+def _surveyed(path: Path, encoding: str) -> tuple[dict[str, Any], Survey]:
+    """Signals of a text, and what is to be told of them: units, doubts, texts of other columns, its encoding; rows read
+    of one that is longer."""
+    layout = read_layout(path, encoding)
+    check_names(path, layout)
+    told = replace(NOTHING_TOLD, encoding=encoding or ("" if layout.encoding == "utf-8" else layout.encoding))
+    if not layout.names:
+        return read_text(path, None, encoding), told
+    cells = scan_text(path, None, layout)
+    doubts = {}
     for c in cells:
         if c.fault is not None:
             doubts[c.name] = f"{c.fault[1][:40]!r} in row {c.fault[0]}"
@@ -132,7 +145,10 @@ def _surveyed(
         x = c.array()
         if x is not None and not alike(out.setdefault(c.name, x), x):
             doubts[c.name] = "several columns that differ"
-    return out
+    units = {n: u for n, u in zip(layout.names, layout.units, strict=False) if u}
+    cut = cells[0].rows if cells and cells[0].rows * len(cells) > MOST_CELLS else 0
+    labels = {c.name: c.labels for c in cells if c.labels}
+    return out, replace(told, units=units, doubts=doubts, cut=cut, labels=labels)
 
 
 def list_signals(path: Path) -> Signals:
@@ -173,19 +189,22 @@ def _instead(x: np.ndarray | None) -> str:
     }.get(kind, "")  # fmt: skip
 
 
-def _read(path: Path, wanted: set[str] | None, by: Reader | None = None) -> dict[str, Any]:
-    """Signals of a file; None wants them all. ``by``: another reader than that of its suffix."""
+def _of(path: Path, read: Callable[[Path], T]) -> T:
+    """What is read of a file, whose faults become one line."""
     if not exists(path):
         raise DataError("log", str(path), instead_of_file(path), f"a file of {FORMATS}")
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
+    if path.suffix.lower() not in READERS:
         raise DataError("log", str(path), path.suffix or "no suffix", f"one of {FORMATS}")
     try:
-        return (by or reader)(path, wanted)
+        return read(path)
     except DataError:
         raise
     except Exception as err:  # each reader raises types of its own for damaged files
         raise DataError("log", str(path), f"unreadable ({_reason(err)})", "a complete file") from err
+
+
+def _reader(path: Path) -> Reader:
+    return READERS[path.suffix.lower()]
 
 
 def _reason(err: Exception) -> str:
@@ -414,7 +433,4 @@ READERS: dict[str, Reader] = {
 }  # fmt: skip
 FORMATS = tuple(READERS)
 # Names of signals of formats that tell them without being read; of others ``list_signals``.
-NAMES: dict[str, Callable[[Path], Iterable[str]]] = {
-    ".parquet": lambda path: pa.parquet.read_schema(path).names,
-    **{suffix: text_names for suffix, reader in READERS.items() if reader is read_text},
-}
+NAMES: dict[str, Callable[[Path], Iterable[str]]] = {".parquet": lambda path: pa.parquet.read_schema(path).names}

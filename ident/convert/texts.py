@@ -6,14 +6,15 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
 from ident.convert.cells import Cells
-from ident.convert.layout import LONGEST_LINE, Layout, read_layout
+from ident.convert.encoding import unreadable
+from ident.convert.layout import LONGEST_LINE, MOST_BROKEN, Layout, read_layout
 from robot_assets.errors import DataError
 
 VALUES = "values"  # name of the whole table of a text file without a header
@@ -25,16 +26,19 @@ UNEVEN = re.compile(r"(?:Row #(\d+): )?Expected (\d+) columns, got (\d+): (.*)",
 COMMENT = re.compile(r"[#%].*")
 
 
-def read_text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+def read_text(path: Path, wanted: set[str] | None, encoding: str = "") -> dict[str, Any]:
     """Columns (N,) by name, dates among them; one table ``VALUES`` (N, columns) where there is no header.
+
+    Args:
+        encoding: of the text, as it is stated; empty where it is not.
 
     Raises:
         DataError: where a signal that is wanted stands in two columns that differ, or a cell of it is none; with its
             row.
     """
-    layout = read_layout(path)
+    layout = read_layout(path, encoding)
     out: dict[str, np.ndarray] = {}
-    for cells in scan_text(path, wanted):
+    for cells in scan_text(path, wanted, layout):
         x, name = cells.array(), wanted_name(cells.name, wanted)
         if x is None:
             continue
@@ -44,10 +48,9 @@ def read_text(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return out if layout.names else _table(out, layout)
 
 
-def scan_text(path: Path, wanted: set[str] | None) -> list[Cells]:
+def scan_text(path: Path, wanted: set[str] | None, layout: Layout) -> list[Cells]:
     """Columns as they were read. Where all are wanted (None), those of texts are left out, and a long log is read in
     part."""
-    layout = read_layout(path)
     if layout.names:
         keep = {i: n for i, n in enumerate(layout.names) if n and (wanted is None or wanted_name(n, wanted) in wanted)}
     else:
@@ -75,15 +78,22 @@ def wanted_name(name: str, wanted: set[str] | None) -> str:
     return next((w for w in wanted or () if w != name and w.lstrip(SIGNS) == name and name not in (wanted or ())), name)
 
 
-def text_units(path: Path) -> dict[str, str]:
-    """Name -> unit as written in a row below the header; empty where there is none."""
-    layout = read_layout(path)
-    return {n: u for n, u in zip(layout.names, layout.units, strict=False) if u}
+def text_names(path: Path, encoding: str = "") -> list[str]:
+    """Names of the columns.
+
+    Raises:
+        DataError: where they can only be told by an encoding that is not stated.
+    """
+    layout = read_layout(path, encoding)
+    check_names(path, layout)
+    return [n for n in layout.names if n] or [VALUES]
 
 
-def text_names(path: Path) -> list[str]:
-    """Names of the columns."""
-    return [n for n in read_layout(path).names if n] or [VALUES]
+def check_names(path: Path, layout: Layout) -> None:
+    """Raise a DataError where names or units of columns are of an encoding that is not known."""
+    strange = next((n for n in (*layout.names, *layout.units) if not n.isascii()), None)
+    if layout.unsure and strange is not None:
+        raise unreadable(path, strange)
 
 
 def distinct(names: list[str], wanted: set[str] | None, path: Path) -> None:
@@ -138,12 +148,16 @@ def _pieces(path: Path, layout: Layout) -> Iterator[tuple[int, bytes]]:
     with path.open(encoding=layout.encoding, errors="replace", newline=None) as file:
         for _ in range(layout.start):
             file.readline(LONGEST_LINE)
-        line = layout.start
-        while text := file.read(PIECE):
+        line, ahead = layout.start, ""
+        while text := ahead + file.read(PIECE):
+            ahead = ""
             end = file.readline(LONGEST_LINE)
             if len(end) >= LONGEST_LINE:
                 raise DataError("log", str(path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
             text += end
+            if text.count('"') % 2:
+                rest, ends = _rest_of_cell(file)
+                text, ahead = (text + rest, "") if ends else (text, rest)
             lines = text.count("\n")
             if not layout.names:
                 text = COMMENT.sub("", text)
@@ -152,6 +166,17 @@ def _pieces(path: Path, layout: Layout) -> Iterator[tuple[int, bytes]]:
             if text.strip():
                 yield line, text.encode()
             line += lines
+
+
+def _rest_of_cell(file: TextIO) -> tuple[str, bool]:
+    """The next lines up to one that ends a cell in quotes, which may hold breaks, and whether one does soon: else the
+    quotes above belong to no such cell."""
+    rest = ""
+    for _ in range(MOST_BROKEN):
+        rest += file.readline(LONGEST_LINE)
+        if rest.count('"') % 2:
+            return rest, True
+    return rest, False
 
 
 def _single_blanks(text: str) -> str:
