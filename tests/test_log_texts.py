@@ -254,8 +254,8 @@ def test_ranges_in_a_guess_are_those_of_the_numbers(tmp_path):
     log = written(tmp_path, [c.replace(f";{X[k]};", ";;") for k, c in enumerate(cells)], "t;x;u")
     with pytest.raises(DataError, match="found x without a number in it, expected numbers"):
         converted(log)
-    np.savez(tmp_path / "log.npz", log=np.zeros(50, [("q", float), ("tau", float)]))
-    with pytest.raises(DataError, match=r"log has structures in place of numbers"):
+    np.savez(tmp_path / "log.npz", log=np.zeros(50, "V8"))
+    with pytest.raises(DataError, match=r"log has structures or objects in place of numbers"):
         guess_map([tmp_path / "log.npz"], "twomass")
 
 

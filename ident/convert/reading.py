@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,16 +16,13 @@ import pyarrow.parquet
 from ident.convert.cells import LABELLED, labels_of
 from ident.convert.dates import as_dates, dates_of_texts, seconds
 from ident.convert.layout import read_layout
-from ident.convert.texts import MOST_CELLS, alike, check_names, distinct, read_text, scan_text, text_names
-from ident.unpacked import check_matlab, check_mcap, check_size, check_zip
+from ident.convert.matlab import DEEPEST, MOST_ELEMENTS, read_matlab
+from ident.convert.texts import MOST_CELLS, VALUES, alike, check_names, distinct, read_text, scan_text, text_names
+from ident.unpacked import check_mcap, check_size, check_zip
 from robot_assets.errors import DataError
 from robot_assets.values import exists, instead_of_file
 
-DEEPEST = 8  # structures inside structures that are looked into
-MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
-MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
 CHANGING = np.array([["a", "b"], ["b", "a"]])  # stands for a list of texts that is not the same in all rows
-LONGEST_NAME = 200  # characters
 NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
 Signals = dict[str, np.ndarray]
 T = TypeVar("T")
@@ -112,7 +109,7 @@ def survey_log(path: Path, encoding: str = "") -> Survey:
         if (strings := _strings(value)) is not None:
             lists[name] = strings
         if x is not None and x.dtype.kind == "V":
-            doubts[name] = "structures in place of numbers: save each field as an array"
+            doubts[name] = "structures or objects in place of numbers: save their fields as arrays"
         if x is None or x.ndim > 2 or x.dtype.kind not in "fiuMm":
             continue
         if x.dtype.kind in "Mm":
@@ -185,7 +182,7 @@ def _instead(x: np.ndarray | None) -> str:
         kind = "U"
     return {
         "b": " but of true and false", "M": " but of dates", "m": " but of times", "U": " but of texts", "S": " but of texts",
-        "V": " but of structures", "c": " but of complex numbers", "O": " but of objects",
+        "V": " but of structures or objects: save their fields as arrays", "c": " but of complex numbers", "O": " but of objects",
     }.get(kind, "")  # fmt: skip
 
 
@@ -294,15 +291,18 @@ def _holds_numbers(kind: pa.DataType) -> bool:
 
 
 def _npz(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    check_zip(path, wanted)
-    out = {}
+    # A field of a structured array is array.field.
+    members = None if wanted is None else {w.rsplit(".", k)[0] for w in wanted for k in range(w.count(".") + 1)}
+    check_zip(path, members)
+    out: dict[str, Any] = {}
     with np.load(path, allow_pickle=False) as file:
-        distinct([name.removesuffix(".npy") for name in file.zip.namelist()], wanted, path)
+        distinct([name.removesuffix(".npy") for name in file.zip.namelist()], members, path)
         for name in file.files:
-            if wanted is not None and name not in wanted:
+            if members is not None and name not in members:
                 continue
             try:
-                out[name] = file[name]
+                x = file[name]
+                out |= _fields(name, x) | ({name: x} if name in (wanted or ()) else {})
             except ValueError as err:
                 if wanted is None:  # one that no one may want
                     continue
@@ -312,105 +312,19 @@ def _npz(path: Path, wanted: set[str] | None) -> dict[str, Any]:
     return out
 
 
-def _mat(path: Path, wanted: set[str] | None) -> dict[str, Any]:
-    import h5py
-    import scipy.io
+def _npy(path: Path, wanted: set[str] | None) -> dict[str, Any]:
+    x = np.load(path, mmap_mode="r", allow_pickle=False)  # a header may tell of more than the file has
+    return _fields("", x) if x.dtype.names else {VALUES: x.reshape(len(x), -1) if x.ndim == 1 else x}
 
-    if h5py.is_hdf5(path):
-        with h5py.File(path) as file:
-            return _hdf5(path, file, wanted)
-    check_matlab(path)
-    out: dict[str, Any] = {}
 
-    def walk(name: str, value: Any, depth: int) -> None:
-        if hasattr(value, "_fieldnames"):
-            for key in value._fieldnames if depth < DEEPEST else []:
-                walk(f"{name}.{key}", getattr(value, key), depth + 1)
-        elif _cells_of_texts(value):
-            out[name] = value.ravel().astype(str)
-        elif isinstance(value, np.ndarray) and value.dtype == object and value.size and depth < DEEPEST:
-            for key, part in _elements(name, value.ravel()):
-                walk(key, part, depth + 1)
-        elif wanted is None or name in wanted:
-            out[name] = value
-
-    for name, value in scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False).items():
-        if isinstance(name, str) and not name.startswith("__"):
-            walk(name, value, 0)
+def _fields(name: str, x: np.ndarray, depth: int = 0) -> dict[str, np.ndarray]:
+    """An array by its name; of a structured one each field as name.field."""
+    if not x.dtype.names or depth > DEEPEST:
+        return {name: np.squeeze(x) if depth and x.ndim > 2 else x}
+    out: dict[str, np.ndarray] = {}
+    for field_name in x.dtype.names:
+        out |= _fields(f"{name}.{field_name}" if name else field_name, x[field_name], depth + 1)
     return out
-
-
-def _cells_of_texts(value: Any) -> bool:
-    """Whether a value of a MATLAB file is a short list of texts, which may name columns."""
-    cells = isinstance(value, np.ndarray) and value.dtype == object and 0 < value.size <= MOST_ELEMENTS
-    return cells and all(isinstance(v, str) for v in value.ravel())
-
-
-def _elements(name: str, array: np.ndarray) -> Iterator[tuple[str, Any]]:
-    """Parts of an array of structures or cells, named as MATLAB does; a structure a sample is an array a field."""
-    structures = hasattr(array[0], "_fieldnames")
-    if len(array) <= MOST_ELEMENTS:
-        brackets = "()" if structures else "{}"
-        yield from ((f"{name}{brackets[0]}{k + 1}{brackets[1]}", part) for k, part in enumerate(array))
-        return
-    for key in array[0]._fieldnames if structures else ():
-        parts = [np.asarray(getattr(part, key, None)) for part in array]
-        if all(p.shape == parts[0].shape and p.dtype.kind in "fiu" for p in parts):
-            yield f"{name}.{key}", np.stack(parts)
-
-
-def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
-    """Arrays of numbers of a MATLAB 7.3 file."""
-    import h5py
-
-    found: dict[str, Any] = {}
-    texts: dict[str, np.ndarray] = {}
-    groups, items = set(), 0
-
-    def walk(group: Any, start: str, depth: int) -> None:
-        nonlocal items
-        address = h5py.h5o.get_info(group.id).addr
-        if depth > DEEPEST or address in groups:  # a group may hold itself
-            return
-        groups.add(address)
-        for name in group:
-            items += 1
-            if items > MOST_ITEMS:
-                raise DataError("log", str(path), f"more than {MOST_ITEMS} groups and arrays", "a recording")
-            # Where MATLAB keeps what cells hold; and links, which may lead out of the file.
-            if (name.startswith("#") and not start) or not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                continue
-            item, dotted = group[name], f"{start}{name}"
-            if isinstance(item, h5py.Group):
-                walk(item, f"{dotted}.", depth + 1)
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and (wanted is None or dotted in wanted):
-                text = item.attrs.get("MATLAB_class", b"") == b"char"
-                if not text and not item.attrs.get("MATLAB_empty", 0):
-                    found[dotted] = item
-            elif isinstance(item, h5py.Dataset) and wanted is None and (cells := _hdf5_texts(file, item)) is not None:
-                texts[dotted] = cells
-
-    walk(file, "", 0)
-    for name, item in found.items():
-        if item.external or item.is_virtual:
-            raise DataError("signal", str(path), f"{name}, which stands in another file", "one in the file itself")
-    check_size(path, sum(item.size * item.dtype.itemsize for item in found.values()))
-    # MATLAB's first dimension is the file's last.
-    return texts | {name: np.asarray(item).T for name, item in found.items()}
-
-
-def _hdf5_texts(file: Any, item: Any) -> np.ndarray | None:
-    """(k,) texts of the cells of a MATLAB 7.3 file, which refer to them; None where they are none, or too many."""
-    import h5py
-
-    if item.dtype != h5py.ref_dtype or item.external or item.is_virtual or not 0 < item.size <= MOST_ELEMENTS:
-        return None
-    parts: list[Any] = [file[ref] if ref else None for ref in np.asarray(item).ravel()]
-    if not all(isinstance(p, h5py.Dataset) and p.attrs.get("MATLAB_class", b"") == b"char" for p in parts):
-        return None
-    if any(p.external or p.is_virtual or p.size > LONGEST_NAME or p.dtype != np.uint16 for p in parts):
-        return None
-    return np.array(["".join(map(chr, np.asarray(p).ravel())) for p in parts])
 
 
 def _mcap(path: Path, wanted: set[str] | None) -> dict[str, Any]:
@@ -428,8 +342,8 @@ def _db3(path: Path, wanted: set[str] | None) -> dict[str, Any]:
 
 
 READERS: dict[str, Reader] = {
-    ".csv": read_text, ".txt": read_text, ".dat": read_text, ".tsv": read_text, ".parquet": _parquet, ".mat": _mat, ".npz": _npz,
-    ".mcap": _mcap, ".db3": _db3,
+    ".csv": read_text, ".txt": read_text, ".dat": read_text, ".tsv": read_text, ".parquet": _parquet, ".mat": read_matlab, ".npz": _npz,
+    ".npy": _npy, ".mcap": _mcap, ".db3": _db3,
 }  # fmt: skip
 FORMATS = tuple(READERS)
 # Names of signals of formats that tell them without being read; of others ``list_signals``.
