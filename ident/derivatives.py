@@ -94,7 +94,7 @@ class _Near:
         W, torques = self.pred.solution.W, self.pred.solution.torques
         if torques.varying is not None:
             steps *= STEPS_ALONG_MOTION
-        return predict(model, self.group, self.problem.sampling, W=W, steps=steps, torques=torques)
+        return predict(model, self.group, self.problem.sampling, W=W, steps=steps, torques=torques, near=self.pred)
 
     @cached_property
     def remade(self) -> Prediction:

@@ -98,7 +98,7 @@ class Criterion:
         remainder answers them so strongly that a step which lowers the cost raises it in truth.
         """
         try:
-            found = predictions(self.problem, at.model, last.remainders, steps=REMAINDER_STEPS, near=last.predictions)
+            found = predictions(self.problem, at.model, last.remainders, steps=REMAINDER_STEPS, near=at.predictions)
             cost = weighted_cost(self.problem, found, self.weights)
         except (np.linalg.LinAlgError, FloatingPointError, ValueError):
             return last

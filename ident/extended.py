@@ -132,6 +132,7 @@ def predict(
     W: np.ndarray | None = None,
     steps: int | None = None,
     torques: Torques = Torques(),
+    near: Prediction | None = None,
 ) -> Prediction:
     """Recorded motor torque along the measured motion of a group, effects included.
 
@@ -140,10 +141,20 @@ def predict(
             chain); None starts cold.
         steps: fixed-point steps on it; ``REMAINDER_STEPS`` cold and 0 warm where None.
         torques: of laws of the gear and the links, to start from (of a model near by with the same chain).
+        near: of another model for the same group; its linear arm is not made anew where this model has the same.
     """
     structure, par = model.built
-    plane = make_plane(structure, par, group, sampling)
+    if near is not None and _same_arm(near, structure, par, group, sampling):
+        plane = near.plane
+    else:
+        plane = make_plane(structure, par, group, sampling)
     return predict_at(model, structure, par, plane, group, sampling, W=W, steps=steps, torques=torques)
+
+
+def _same_arm(near: Prediction, structure: Structure, par: Parameters, group: Group, sampling: Sampling) -> bool:
+    """Whether the linear arm of a prediction is that of a chain and drives, for records of a group."""
+    same = near.group is group and near.sampling == sampling and near.structure is structure
+    return same and near.par.same_as(par)
 
 
 # of torques that run away: those who ask see that the result is not finite

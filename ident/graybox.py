@@ -15,7 +15,7 @@ side of the gear.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pinocchio as pin
@@ -82,6 +82,10 @@ class Parameters:
                 ]
             )
         )
+
+    def same_as(self, other: Parameters) -> bool:
+        """Whether all figures are those of another one."""
+        return all(np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
     def with_log(self, x: np.ndarray) -> Parameters:
         """A copy with the positive parameters taken from ``to_log`` order."""

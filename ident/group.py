@@ -278,24 +278,22 @@ class Group:
         return to_lines(x, len(self.omega))
 
     @cached_property
-    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
-        """(K, L) of a line, and of its conjugate, that the window shows at each compared one."""
-        W = scipy.fft.fft(self.window, norm="forward")
-        k, l = np.arange(self.n_compared)[:, None], np.arange(len(self.omega))
-        of_conjugate = W[(k + l) % len(W)]
-        of_conjugate[:, 0] = 0.0  # the mean has no conjugate
-        return W[(k - l) % len(W)], of_conjugate
+    def _coarse_window(self) -> np.ndarray:
+        """The window on the coarsest grid of time on which its product with a signal has the compared lines right."""
+        assert self.window is not None
+        reach = self.n_compared + len(self.omega)  # from a line of a signal to a compared one, or to its conjugate
+        n = scipy.fft.next_fast_len(2 * reach, real=True)
+        return self.window if n >= self.n_time else to_time(to_lines(self.window[:, None], reach), n)[:, 0]
 
     def observe(self, X: np.ndarray) -> np.ndarray:
         """What of a torque spectrum (..., L, m) is compared: its windowed lines (..., K, m).
 
-        The window in time is a convolution of the few lines there are, far cheaper than two transforms.
+        The grid of time of the group is far finer than the compared lines need: the window has a grid of its own.
         """
         if self.window is None:
             return X[..., : self.n_compared, :]
-        of_line, of_conjugate = self._seen
-        X = np.concatenate([X[..., :1, :].real, X[..., 1:, :]], axis=-2)  # as a time signal has it
-        return of_line @ X + of_conjugate @ X.conj()
+        window = self._coarse_window
+        return to_lines(to_time(X, len(window)) * window[:, None], self.n_compared)
 
     def observe_outputs(self, X: np.ndarray) -> np.ndarray:
         """``observe`` for outputs (S, L, n + M, ...); (S, K, n + M, ...).

@@ -133,11 +133,14 @@ def predictions(
     Args:
         near: predictions of a model with the same effects, with whose torques loops begin; from rest where empty.
     """
-    torques = [p.solution.torques for p in near] or [Torques()] * len(problem.groups)
-    return map_threads(
-        lambda of: predict(model, of[0], problem.sampling, W=of[1], steps=steps, torques=of[2]),
-        zip(problem.groups, remainders, torques, strict=True),
-    )
+
+    def one(of: tuple[Group, np.ndarray | None, Prediction | None]) -> Prediction:
+        group, W, p = of
+        torques = p.solution.torques if p else Torques()
+        return predict(model, group, problem.sampling, W=W, steps=steps, torques=torques, near=p)
+
+    told: Sequence[Prediction | None] = near or [None] * len(problem.groups)
+    return map_threads(one, zip(problem.groups, remainders, told, strict=True))
 
 
 def by_joint(problem: Problem, each: Sequence[np.ndarray]) -> np.ndarray:

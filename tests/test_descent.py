@@ -8,6 +8,7 @@ import pytest
 
 from ident import torque_fit
 from ident.descent import Criterion, Point, descend, nuisances
+from ident.extended import predict
 from ident.hypotheses import catalogue
 from ident.model import Effect, Model
 from ident.torque_fit import fit
@@ -109,3 +110,20 @@ def test_columns_are_made_exactly_where_the_others_hardly_get_on(identified, mon
     found = fit(setup.problem, start, iterations=8, remainders=best.remainders, exact=exact)
     assert (found.cost - lowest.cost < 1.0) == close
     assert asked[:2] == [False, False]
+
+
+def test_the_linear_arm_is_made_anew_where_the_drives_are_others_alone(identified):
+    _, setup, result = identified
+    problem, group = setup.problem, setup.problem.groups[0]
+    there = predict(result.model, group, problem.sampling)
+    same = predict(replace(result.model), group, problem.sampling, near=there)
+    assert same.plane is there.plane and np.array_equal(same.U, there.U)
+    par = replace(result.model.par, viscous=1.01 * result.model.par.viscous)
+    other = replace(result.model, par=par)
+    moved = predict(other, group, problem.sampling, near=there)
+    assert moved.plane is not there.plane
+    assert np.array_equal(moved.U, predict(other, group, problem.sampling).U)
+    later = replace(problem.sampling, roll_off=1e-6)
+    assert predict(result.model, group, later, near=there).plane is not there.plane
+    few = group.pick(np.arange(1))
+    assert predict(result.model, few, problem.sampling, near=there).plane is not there.plane
