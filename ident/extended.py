@@ -217,6 +217,9 @@ def predict_at(
         passes=passes,
         steps=steps,
     )
+    if group.drift is not None:  # so slowly that the arm follows at rest
+        held = plane.record[:, None] * (group.drift @ plane.Z[0].real.T)
+        solution = replace(solution, U=solution.U + held)
     if motor:
         motion = Motion(group, solution, par, delivered=given, told=along)
         at_motors = plane.record[:, None] * motor_torques(par, motion, motor)

@@ -55,7 +55,8 @@ class Group:
         steps: of a simulation that made the records; None of a machine.
         alike_turn_noise: (n,) as ``turn_noise``, in the mean over the periodic groups of a dataset that models are fitted
             to: friction must not turn otherwise in one posture than in another; that of the group where None.
-        creeps: whether single periods end elsewhere than the one before, of a transient.
+        creeps: whether single periods end elsewhere than the one before, of a transient, or than they began.
+        drift: (S, L, n) rad, lines of what single periods drift by, which ``Q`` is without and ``U`` is not; or None.
         white_noise, white_torque_noise: (n,) variance of a line of one period by the noise of its samples,
             rad2 and N2 m2.
     """
@@ -90,6 +91,7 @@ class Group:
     rounding: np.ndarray | None = None
     alike_turn_noise: np.ndarray | None = None
     creeps: bool = False
+    drift: np.ndarray | None = None
     steps: TimeSteps | None = None
     R: np.ndarray | None = None
 
@@ -240,6 +242,7 @@ class Group:
             "Q_fast",
             "U_noise",
             "Q_noise",
+            "drift",
         )
         parts = {name: getattr(self, name) for name in names}
         kept: dict[str, Any] = {name: None if x is None else x[rows] for name, x in parts.items()}
@@ -247,7 +250,7 @@ class Group:
 
     def slow(self) -> Group:
         """The group with the lines of the geometry alone."""
-        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "R")
+        names = ("U", "Q", "U_periods", "Q_periods", "Q_link", "R", "drift")
         parts = {name: getattr(self, name) for name in names}
         cut: dict[str, Any] = {name: None if x is None else x[..., : self.n_slow, :] for name, x in parts.items()}
         return replace(

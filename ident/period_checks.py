@@ -6,7 +6,9 @@ import numpy as np
 import scipy.signal
 
 from ident.dataset import Dataset, Segment
+from ident.records import drift
 from ident.rest import difference_noise
+from robot_assets.robot import linear_joints
 
 SEEN = 5.0  # rms of a channel over the noise of its samples, from which it can tell
 REPEATS = 0.5  # of what a channel does within a period, by which periods may differ
@@ -14,10 +16,27 @@ TOGETHER = 0.25  # of what all positions do within a period, by which their last
 
 
 def period_warnings(s: Segment, dataset: Dataset) -> list[str]:
-    """A period after which nothing repeats, or positions as a whole do not."""
-    if s.kind != "multisine" or s.steady_periods < 2:
+    """A period after which nothing repeats, or positions as a whole do not; a single one that has not settled."""
+    if s.kind != "multisine":
         return []
+    if s.steady_periods < 2:
+        return _unsettled(s, dataset) if s.steady_periods and not s.transient_periods else []
     return _nothing_repeats(s) or _otherwise_moved(s, dataset)
+
+
+def _unsettled(s: Segment, dataset: Dataset) -> list[str]:
+    """Positions that drift over the only period, that which drifts most beside what it does."""
+    (q,) = s.periodic("q")
+    far = np.ptp(drift(q), axis=0)
+    share = far / np.maximum(np.std(q, axis=0), 1e-300)
+    most = int(np.argmax(share))
+    if not share[most]:
+        return []
+    unit = "m" if linear_joints(dataset.robot)[most] else "rad"
+    return [
+        f"{dataset.joints[most]} ends the only period {far[most]:.2g} {unit} from where it began, {share[most]:.2g} times its rms motion: it"
+        " had not settled. A period recorded before it, as a transient one, tells of that best"
+    ]
 
 
 def _nothing_repeats(s: Segment) -> list[str]:

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 
 from ident.closing import close_motion
 from ident.dataset import Dataset, Segment
@@ -24,7 +25,9 @@ from robot_assets.errors import DataError
 RETURN_TIME = 8.0  # s, least time in which a motion is led back to its start: what still rings then has decayed
 # tapered at both ends of a motion: s, and periods of the highest compared frequency, at least
 SETTLE_TIME, SETTLE_PERIODS = 0.5, 2.0
+FEWEST_SAMPLES = 100  # of a period that tells how it goes on from sample to sample
 BORDER_SAMPLES = 8  # at either end of a period, from which it is told where it begins and ends
+STEP_ORDER = 5  # of the polynomial that a signal is within these on both sides of a step
 CREEP = 6.0  # standard deviations of their noise, by which both must differ
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
@@ -118,6 +121,8 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
     top = min(int(np.floor(band_hz * N / fs + 1e-9)), N // 2 - 1)
     n_lines = min(int(np.ceil(SIGNAL_BAND * top)) + 2, N // 2)
     q = [_steady(s, "q") for s in members]
+    drifts = [drift(x[0]) if len(x) == 1 and s.transient_periods == 0 else 0.0 for s, x in zip(members, q, strict=True)]
+    q = [x - d for x, d in zip(q, drifts, strict=True)]
     U_p = np.stack([_lines(_steady(s, "tau"), n_lines) for s in members])
     Q_p = np.stack([_lines(x, n_lines) for x in q])
     link = None
@@ -160,6 +165,9 @@ def _periodic_group(dataset: Dataset, members: list[Segment], band_hz: float, be
         U_noise=noise[0],
         Q_noise=noise[1],
         R=excitation,
+        drift=np.stack([_lines(np.broadcast_to(d, x.shape), n_lines)[0] for x, d in zip(q, drifts, strict=True)])
+        if any(np.any(d) for d in drifts)
+        else None,
         creeps=any(len(x) == 1 and np.any(x != s.periodic("q")) for x, s in zip(q, members, strict=True)),
     )
     return replace(group, rest=group.rest | turning(group))
@@ -201,6 +209,25 @@ def without_creep(x: np.ndarray, before: np.ndarray | None = None) -> np.ndarray
     noise = np.maximum(2.0 * difference_noise(x.reshape(P * N, -1)) / np.sqrt(width), _change(change, width))
     at = np.arange(P * N).reshape(P, N, 1) - 0.5 * (P * N - 1)
     return x - at * np.where(np.abs(jump) > CREEP * noise, jump, 0.0) / (P * N)
+
+
+def drift(x: np.ndarray) -> np.ndarray:
+    """(N, n) the line about zero by which a single period (N, n) drifts, where its end leads elsewhere than to its
+    beginning: as of a loop that has not settled yet, where no period before tells of it."""
+    if len(x) < FEWEST_SAMPLES:
+        return np.zeros_like(x)
+    steps = _steps(x)
+    usual = np.sqrt(np.mean(steps[2 * BORDER_SAMPLES : 1 - 2 * BORDER_SAMPLES] ** 2, axis=0))
+    share = (np.arange(len(x))[:, None] - 0.5 * (len(x) - 1)) / len(x)
+    return -share * np.where(np.abs(steps[0]) > CREEP * usual, steps[0], 0.0)
+
+
+def _steps(x: np.ndarray) -> np.ndarray:
+    """(N, n) by how much a signal (N, n) that repeats seems to step before each sample, beside a polynomial through
+    the samples on either side."""
+    t = (np.arange(2 * BORDER_SAMPLES) - BORDER_SAMPLES + 0.5) / BORDER_SAMPLES
+    columns = np.concatenate([t[:, None] ** np.arange(STEP_ORDER + 1), (t > 0)[:, None]], axis=1)
+    return scipy.ndimage.correlate1d(x, np.linalg.pinv(columns)[-1], axis=0, mode="wrap")
 
 
 def _change(x: np.ndarray, width: int) -> np.ndarray:
