@@ -68,6 +68,7 @@ from ident.units import linear_names, unit_at
 from ident.values import baseline_values, extended_baseline, inertia_values, named_effects, reported_parameters
 from ident.verdict import UNKNOWN, Alternative, Cause, Discrepancy, Gain, Value, Verdict, Where
 
+LATE_SURE, LATE_LIKELY, LATE_DOUBTED = 0.95, 0.6, 0.4  # probabilities of a link encoder that comes late
 FEWEST = 2.0  # numbers that are compared, for each that is fitted, below which no name is trusted
 LEFT_SHARE = 0.03  # share of the discrepancy left over, above which an unknown cause remains
 TOLD = 0.2  # standard deviation of the Coulomb friction that drifts over its size, up to which the data show it
@@ -255,7 +256,8 @@ def seen_in_samples(found: Findings) -> tuple[Cause, ...]:
     """Causes that the samples themselves show, and no fit."""
     joints, linear = found.dataset.joints, linear_names(found.dataset.robot)
     rounded = (_rounded(x, joints[x.joint], linear) for x in found.setup.steps)
-    return (*rounded, *(_late(x, joints[x.joint]) for x in found.late))
+    remains = bool(found.late) and cause_remains(found, is_refuted(found))
+    return (*rounded, *(_late(x, joints[x.joint], remains) for x in found.late))
 
 
 def places(found: Findings, tones: Sequence[Tone]) -> Iterator[Where]:
@@ -344,13 +346,17 @@ def _rounded(steps: Steps, joint: str, linear: Collection[str]) -> Cause:
     )
 
 
-def _late(late: LinkDelay, joint: str) -> Cause:
-    """The cause of a link encoder that lags the motor encoder: the torque equation does not hold it."""
+def _late(late: LinkDelay, joint: str, remains: bool) -> Cause:
+    """The cause of a link encoder that lags the motor encoder: the torque equation does not hold it.
+
+    Args:
+        remains: whether an unknown cause does, which may wind up the gear as well.
+    """
     return Cause(
         effect="sensor_delay",
         joint=joint,
         parameters={"delay": Value(late.delay, late.std, "s")},
-        probability=0.95 if late.clear else 0.6,
+        probability=LATE_SURE if late.clear else LATE_DOUBTED if remains else LATE_LIKELY,
         evidence=f"The link encoder of {joint} comes {late.delay:.3g} s after its motor encoder: their difference follows the velocity, which looks like wind-up of the gear"
         + (" and is not." if late.clear else "; viscous friction of the link would look the same."),
         alternatives=(),
@@ -373,7 +379,7 @@ def _cause(
     """
     h = effect.hypothesis
     joints = h.options.get("joints", ())
-    name, parameter_called = called(effect, groups)
+    name, parameter_called = called(effect, groups, final.model.par.stiffness)
     own, others = 0.0 if candidates else 1.0, dict[tuple[str, str], float]()
     for c in candidates:
         other, place = told_name(c, groups), c.hypothesis.place

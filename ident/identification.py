@@ -227,7 +227,7 @@ def whitened(problem: Problem, result: Fit, found: Sequence[Prediction]) -> list
 def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fit) -> Problem:
     """Sample noise, raised to what lines show that nothing excites, where periods show no scatter.
 
-    Noise that is given is raised where all that is left is alike at all lines and joints: it says nothing of noise whose
+    Noise that is given is raised where what is left is alike at all lines of most joints: it says nothing of noise whose
     samples go together.
     """
     unknown = all(g.window is None and not g.shows_noise for g in problem.groups)
@@ -235,7 +235,9 @@ def with_noise_of_unexcited_lines(dataset: Dataset, problem: Problem, result: Fi
         return problem
     left = whitened(problem, result, predictions(problem, result.model, result.remainders))
     guessed = guessed_noise(dataset)
-    power = unexcited_noise(problem.groups, left) if any(guessed) else alike_at_all_lines(problem.groups, left)
+    power: float | np.ndarray | None = unexcited_noise(problem.groups, left) if any(guessed) else 1.0
+    if power == 1.0:  # where much is missing at few joints, others tell
+        power = alike_at_all_lines(problem.groups, left)
     if power is None or not np.any(power > 1.0):
         return problem
     raised = guessed if any(guessed) else (True, True)

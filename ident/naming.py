@@ -13,15 +13,17 @@ from ident.model import Effect
 MOVES = 0.1  # of the largest motion of a joint, from which it moves
 
 
-def called(effect: Effect, groups: Sequence[Group]) -> tuple[str, Mapping[str, str]]:
+def called(effect: Effect, groups: Sequence[Group], stiffness: np.ndarray) -> tuple[str, Mapping[str, str]]:
     """The name under which an effect is told, and those of parameters that are called otherwise there.
 
     Args:
         groups: records whose motion says how near to a special case it is.
+        stiffness: (n,) of the gears, N m/rad, which says so too.
     """
     h = effect.hypothesis
-    special = h.options["called"](effect.p, usual_swing(groups, h.joint)) if "called" in h.options else None
-    return special or (h.effect, {})
+    if "called" not in h.options:
+        return h.effect, {}
+    return h.options["called"](effect.p, usual_swing(groups, h.joint), stiffness[h.joint]) or (h.effect, {})
 
 
 def told_name(candidate: Candidate, groups: Sequence[Group]) -> str:
@@ -30,7 +32,7 @@ def told_name(candidate: Candidate, groups: Sequence[Group]) -> str:
     if h.decoy:
         return "unknown"
     tried = [e for e in candidate.fit.model.effects if e.hypothesis.key == h.key]
-    return called(tried[0], groups)[0] if tried else h.effect
+    return called(tried[0], groups, candidate.fit.model.par.stiffness)[0] if tried else h.effect
 
 
 def usual_swing(groups: Sequence[Group], joint: int) -> float:

@@ -236,17 +236,17 @@ def unexcited_noise(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> 
 def alike_at_all_lines(groups: Sequence[Group], whitened: Sequence[np.ndarray]) -> np.ndarray | None:
     """Power (n,) of what a model leaves, over that of the noise it was whitened with, where that is noise; None else.
 
-    It is where each joint is left as much at excited lines as at other odd ones and at even ones near by, and most
-    joints are left more than noise as given. What a linear model lacks shows at excited lines alone, a distortion at
-    odd ones more than at even ones or the other way round, and both at a joint of their own (Pintelon and Schoukens
-    2012, 4.3).
+    It is where most joints are left more than noise as given, and as much at excited lines as at other odd ones and at
+    even ones near by. What a linear model lacks shows at excited lines alone, a distortion at odd ones more than at
+    even ones or the other way round, and both at a joint of their own (Pintelon and Schoukens 2012, 4.3): such a joint
+    has the noise of the others, or what it is left at the lines where that is least.
 
     Args:
         whitened: as of ``unexcited_noise``.
     """
     n = whitened[0].shape[2]
     ratio, count = np.zeros((3, n)), np.zeros((3, 1))
-    total, lines = np.zeros(n), 0
+    total = np.zeros((3, n))
     for group, Z in zip(groups, whitened, strict=True):
         power = np.abs(Z[:, 1:]) ** 2
         near = mean_over_lines(power.mean(axis=0), BAND_LINES)
@@ -254,11 +254,16 @@ def alike_at_all_lines(groups: Sequence[Group], whitened: Sequence[np.ndarray]) 
         for i, kind in enumerate((excited, ~excited & odd, ~excited & ~odd)):
             ratio[i] += np.sum((power / np.maximum(near, 1e-300))[kind], axis=0)
             count[i] += np.sum(kind)
-        total, lines = total + 0.5 * np.sum(power, axis=(0, 1)), lines + power[..., 0].size
+            total[i] += 0.5 * np.sum(power[kind], axis=0)
     told = count[:, 0] >= FEW_LINES
-    mean, left = ratio[told] / count[told], total / max(lines, 1)
-    alike = told[0] and np.any(told[1:]) and mean.max() < FLAT * mean.min()
-    return left if n > 1 and alike and np.sum(left > FLAT) > n / 2 else None
+    if n < 2 or not told[0] or not np.any(told[1:]):
+        return None
+    mean, left = ratio[told] / count[told], total.sum(axis=0) / count.sum()
+    alike = mean.max(axis=0) < FLAT * mean.min(axis=0)
+    if np.sum(alike & (left > FLAT)) <= n / 2:
+        return None
+    least = np.min(total[told] / count[told], axis=0)
+    return np.where(alike, left, np.minimum(least, np.median(left[alike])))
 
 
 def torque_noise_left(left: Sequence[np.ndarray], shares: Sequence[np.ndarray]) -> np.ndarray:

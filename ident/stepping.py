@@ -14,7 +14,7 @@ from typing import get_args
 
 import numpy as np
 
-from ident.baseline import renewed
+from ident.baseline import DETECTION_EXCESS, renewed
 from ident.derivatives import jacobians
 from ident.extended import Prediction
 from ident.inverse import plane_at, torque_record
@@ -44,9 +44,10 @@ def with_steps(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
 
 def told_by(before: Fit, after: Fit) -> bool:
     """Whether a fit in time steps explains what one without leaves, at most joints, and leaves hardly more than noise
-    there."""
-    settled = after.costs <= SETTLED * after.counts
-    return told_by_most(before, after) and 2 * int(np.sum(settled)) > len(settled)
+    there, and at most of those where that one leaves more."""
+    settled, left = after.costs <= SETTLED * after.counts, before.costs > DETECTION_EXCESS * before.counts
+    most = 2 * int(np.sum(settled)) > len(settled) and 2 * int(np.sum(settled & left)) > int(np.sum(left))
+    return told_by_most(before, after) and most
 
 
 def in_steps(problem: Problem, steps: TimeSteps) -> Problem:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ident.attribute import LAWS_LEAVE, LEFT_TO_DECOYS, Attribution, attribute, less_errors_of_laws
 from ident.baseline import astray, discrepancy_p_value, loud
 from ident.chain import build_structure
-from ident.conclude import Findings, _cause, _drifting_friction, cause_remains, conclude
+from ident.conclude import Findings, _cause, _drifting_friction, _late, cause_remains, conclude
 from ident.contests import alike, best_of_each, in_reach, same_as_special
 from ident.coordinates import PRIOR_LOG_STD, pack, unpack
 from ident.costs import joint_costs, noise_costs, weighted_cost
@@ -41,8 +41,9 @@ from ident.hypotheses.sensing import encoder_eccentricity, torque_offset
 from ident.hypotheses.structure import apply_change
 from ident.identification import identify
 from ident.inverse import REMAINDER_STEPS, plane_at, solve, stalled
+from ident.link_sensor import LinkDelay
 from ident.model import Effect, along_record
-from ident.naming import usual_swing
+from ident.naming import called, usual_swing
 from ident.notes import faint_note, held_out_note, load_note
 from ident.parallel import Workers
 from ident.posture import moved_by_gears
@@ -282,6 +283,33 @@ def test_a_friction_that_drifts_by_less_than_its_law_errs_is_coulombs(named):
     for change, absent in ((-0.007, True), (0.015, True), (-0.05, False)):
         effect = Effect(drift, np.array([change, 300.0, 5.0, 1e-3, 0.0]))
         assert pointless(effect, 1e4) == plainly_special(None, None, effect) == absent
+
+
+@pytest.mark.parametrize(("clear", "remains", "sure"), [(True, True, True), (False, False, True), (False, True, False)])
+def test_a_link_encoder_is_late_for_sure_only_where_nothing_else_may_wind_up_the_gear(clear, remains, sure):
+    cause = _late(LinkDelay(3, 6e-5, 4e-6, clear), "wrist_1_joint", remains)
+    assert (cause.effect, cause.joint, cause.channel) == ("sensor_delay", "wrist_1_joint", "q_link")
+    assert (cause.probability > 0.5) is sure
+
+
+@pytest.mark.parametrize(
+    ("give", "stiffer", "name"),
+    [
+        (1.2e-4, 2.0, "coulomb_friction"),
+        (1.2e-4, 0.2, "presliding_friction"),
+        (1e-3, 2.0, "presliding_friction"),
+    ],
+)
+def test_a_bristle_is_dry_friction_where_it_slips_at_once_and_gives_less_than_the_gear(named, give, stiffer, name):
+    """One that is 26 times softer than the gear had been a Coulomb friction in motions of half a radian."""
+    h, k = named["presliding_friction", "elbow_joint"], 5e4
+    p = {"stiffness": stiffer * k, "coulomb": give * stiffer * k}
+    effect = Effect(h, np.array([p.get(q.name, q.center) for q in h.parameters]))
+    swing = np.zeros((1, 2, 6), complex)
+    swing[:, 1] = 0.02 / np.sqrt(2.0)
+    stiffness = np.full(6, 1e2)
+    stiffness[h.joint] = k
+    assert called(effect, [SimpleNamespace(Q=swing)], stiffness)[0] == name
 
 
 def test_a_load_has_odds_over_a_body_only_where_that_is_clearly_off():

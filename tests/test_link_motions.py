@@ -165,7 +165,7 @@ def test_a_part_of_a_sample_by_which_a_link_encoder_is_late(still, samples, name
     assert [x.joint for x in late] == ([joint] if named else [])
     for x in late:
         assert x.delay == pytest.approx(samples * step, rel=0.05) and x.clear == clear
-        cause = _late(x, "elbow_joint")
+        cause = _late(x, "elbow_joint", False)
         assert (cause.probability > 0.9) == clear and cause.probability > 0.5
         assert ("friction of the link" in cause.evidence) == (not clear)
 

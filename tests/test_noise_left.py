@@ -91,6 +91,10 @@ def test_what_is_alike_at_all_lines_and_joints_is_noise(lacks):
     found = alike_at_all_lines(groups, [Z])
     assert found == pytest.approx(np.full(3, 2.5), rel=0.1) if lacks == "nothing" else found is None
     assert alike_at_all_lines(groups, [Z[..., :1]]) is None  # a single joint has none beside it
+    if lacks in ("excited lines", "odd lines", "even lines"):  # at one joint alone, which the others speak for
+        Z[also][..., :2] /= np.sqrt(2.0)
+        Z[also][..., 2] *= 10.0
+        assert alike_at_all_lines(groups, [Z]) == pytest.approx(np.full(3, 2.5), rel=0.1)
     assert np.array_equal(excited.sum(axis=1), np.full(4, 50))  # as it was
 
 

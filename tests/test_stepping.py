@@ -10,7 +10,7 @@ from ident.diagnosis import diagnose
 from ident.graybox import Parameters, equilibrium, impedance, linearise
 from ident.identification import identify
 from ident.roll_off import told_by_most
-from ident.stepping import shown_steps
+from ident.stepping import shown_steps, told_by
 from ident.time_steps import TimeSteps, differences
 from sim import parse_effect
 from sim.experiment import draw_drives
@@ -78,6 +78,23 @@ def test_what_joints_share_need_not_explain_noise_that_is_known_too_small(left, 
     before = SimpleNamespace(costs=left * counts, counts=counts)
     assert told_by_most(before, SimpleNamespace(costs=left * counts - 50.0, counts=counts)) == told
     assert not told_by_most(before, before)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ([2.0, 2.0, 2.0, 1.0, 9.0], [1.0, 1.0, 1.0, 0.9, 8.9], True),  # a cause at the last joint
+        (
+            [0.7, 0.7, 0.7, 1.9, 4.9],
+            [0.5, 0.5, 0.5, 1.8, 3.6],
+            False,
+        ),  # noise that is known too large hides what is left
+    ],
+)
+def test_steps_are_told_by_joints_that_leave_more_than_noise_without_them(before, after, told):
+    counts = np.full(5, 1e4)
+    fits = [SimpleNamespace(costs=counts * x, counts=counts) for x in (before, after)]
+    assert told_by(*fits) is told
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ OF_A_DIP = {"apart": "stribeck_velocity", "shown": "static", "exceeds": ("static
 TURN_SHARE = 2e-3  # velocity within which a friction turns over that of its dip, at first
 RISING = 0.2, 0.9  # exponents between a friction of constant size and a viscous one
 MOST_GIVE = 0.3  # rad or m, of a bristle before it slips: what gives by more is a spring
-SLIPS_AT_ONCE = 0.01  # of the usual motion, within which a bristle that slips is a dry friction that turns
+SLIPS_AT_ONCE = 0.01  # of the usual motion, within which a bristle stiffer than the gear is a dry friction that turns
 GIVES = 3e-4, 3e-3, 3e-2  # of a bristle before it slips, at first, over the rms motion
 START_TIME = 0.05  # s, over which the torque at the start of a motion is averaged: half a period of its band
 PROJECTIONS = 2  # of what is asked at rest, onto what dry friction can be
@@ -394,8 +394,10 @@ def presliding_friction(joint: int, place: str, damped: bool = True) -> Hypothes
             "apart": "stiffness",
             "shown": "coulomb",
             "give": lambda p: p[1] / p[0],
-            "called": lambda p, swing: (
-                ("coulomb_friction", {"coulomb": "torque"}) if p[1] < SLIPS_AT_ONCE * swing * p[0] else None
+            "called": lambda p, swing, k: (
+                ("coulomb_friction", {"coulomb": "torque"})
+                if p[1] < SLIPS_AT_ONCE * swing * p[0] and p[0] > k
+                else None
             ),
             "trivial": lambda p, k: p[1] > MOST_GIVE * p[0],
             # A bristle that hardly bends and is damped turns before the velocity does.
