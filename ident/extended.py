@@ -17,6 +17,7 @@ from ident.inverse import (
     REMAINDER_STEPS,
     Plane,
     Sampling,
+    drifting_torque,
     make_plane,
     plane_at,
     solve,
@@ -141,7 +142,8 @@ def predict(
             chain); None starts cold.
         steps: fixed-point steps on it; ``REMAINDER_STEPS`` cold and 0 warm where None.
         torques: of laws of the gear and the links, to start from (of a model near by with the same chain).
-        near: of another model for the same group; its linear arm is not made anew where this model has the same.
+        near: of a model with the same effects or some of them; its linear arm is not made anew where the records, and
+            the chain and drives of the model, are the very same.
     """
     structure, par = model.built
     if near is not None and _same_arm(near, structure, par, group, sampling):
@@ -217,9 +219,9 @@ def predict_at(
         passes=passes,
         steps=steps,
     )
-    if group.drift is not None:  # so slowly that the arm follows at rest
-        held = plane.record[:, None] * (group.drift @ plane.Z[0].real.T)
-        solution = replace(solution, U=solution.U + held)
+    if group.drift is not None:
+        drifting = plane.record[:, None] * drifting_torque(plane.Z, group.drift)
+        solution = replace(solution, U=solution.U + drifting)
     if motor:
         motion = Motion(group, solution, par, delivered=given, told=along)
         at_motors = plane.record[:, None] * motor_torques(par, motion, motor)

@@ -170,6 +170,17 @@ def true_position(
     return group.Q - alias * group.U / par.inertia
 
 
+def drifting_torque(Z: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """(S, L, n) torque along a line of the position, of lines ``drift`` (S, L, n), so slowly that the arm follows at rest.
+
+    Args:
+        Z: (L, n, n) torque per motor position, of which the first line above zero tells what a velocity takes.
+    """
+    out = drift @ Z[0].real.T
+    out[:, 0] += drift[:, 1].imag @ Z[1].imag.T  # the mean velocity of a line is omega_1 Im X_1
+    return out
+
+
 def static_remainder(structure: Structure, par: Parameters, plane: Plane, group: Group) -> np.ndarray:
     """Remainder of the arm at rest: the gravity torque about which it is linearised; (S, L, N)."""
     S, L = group.U.shape[:2]

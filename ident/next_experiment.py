@@ -165,7 +165,7 @@ def moved(group: Group, factor: float, joint: int, shift: float) -> Group:
     scale[:, 0] = 1.0
     Q = scale * group.Q
     Q[:, 0, joint] += shift
-    return replace(group, Q=Q, U=scale * group.U, amplitude=factor * group.amplitude)
+    return replace(group, Q=Q, U=scale * group.U, amplitude=factor * group.amplitude, drift=None)
 
 
 def _peak(group: Group) -> np.ndarray:

@@ -34,8 +34,8 @@ def _unsettled(s: Segment, dataset: Dataset) -> list[str]:
         return []
     unit = "m" if linear_joints(dataset.robot)[most] else "rad"
     return [
-        f"{dataset.joints[most]} ends the only period {far[most]:.2g} {unit} from where it began, {share[most]:.2g} times its rms motion: it"
-        " had not settled. A period recorded before it, as a transient one, tells of that best"
+        f"{dataset.joints[most]} ends the only period {far[most]:.2g} {unit} from where it began, {share[most]:.2g}"
+        " times its rms motion: it had not settled. A period recorded before it, as a transient one, tells of that best"
     ]
 
 

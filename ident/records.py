@@ -28,6 +28,7 @@ SETTLE_TIME, SETTLE_PERIODS = 0.5, 2.0
 FEWEST_SAMPLES = 100  # of a period that tells how it goes on from sample to sample
 BORDER_SAMPLES = 8  # at either end of a period, from which it is told where it begins and ends
 STEP_ORDER = 5  # of the polynomial that a signal is within these on both sides of a step
+CORNERS = 2.0  # of the largest step that a signal seems to take elsewhere, by which it must at least
 CREEP = 6.0  # standard deviations of their noise, by which both must differ
 MOTION_RATE = 2000.0  # 1/s, of the time grid of motions, at most: enough for the ripple of a fast motor
 POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
@@ -213,21 +214,28 @@ def without_creep(x: np.ndarray, before: np.ndarray | None = None) -> np.ndarray
 
 def drift(x: np.ndarray) -> np.ndarray:
     """(N, n) the line about zero by which a single period (N, n) drifts, where its end leads elsewhere than to its
-    beginning: as of a loop that has not settled yet, where no period before tells of it."""
+    beginning: as of a loop that has not settled yet, where no period before tells of it.
+
+    There it steps by more than anywhere else, and by more than it bends from one sample to the next: a motion may begin
+    with a corner.
+    """
     if len(x) < FEWEST_SAMPLES:
         return np.zeros_like(x)
-    steps = _steps(x)
-    usual = np.sqrt(np.mean(steps[2 * BORDER_SAMPLES : 1 - 2 * BORDER_SAMPLES] ** 2, axis=0))
+    steps, bends = _steps(x)
+    elsewhere = np.abs(steps[2 * BORDER_SAMPLES : 1 - 2 * BORDER_SAMPLES])
+    usual = np.maximum(CREEP * np.sqrt(np.mean(elsewhere**2, axis=0)), CORNERS * elsewhere.max(axis=0))
     share = (np.arange(len(x))[:, None] - 0.5 * (len(x) - 1)) / len(x)
-    return -share * np.where(np.abs(steps[0]) > CREEP * usual, steps[0], 0.0)
+    return -share * np.where(np.abs(steps[0]) > np.maximum(usual, np.abs(bends[0])), steps[0], 0.0)
 
 
-def _steps(x: np.ndarray) -> np.ndarray:
-    """(N, n) by how much a signal (N, n) that repeats seems to step before each sample, beside a polynomial through
-    the samples on either side."""
+def _steps(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By how much a signal (N, n) that repeats seems to step before each sample, and its slope to, per sample, beside a
+    polynomial through the samples on either side; (N, n) each."""
     t = (np.arange(2 * BORDER_SAMPLES) - BORDER_SAMPLES + 0.5) / BORDER_SAMPLES
-    columns = np.concatenate([t[:, None] ** np.arange(STEP_ORDER + 1), (t > 0)[:, None]], axis=1)
-    return scipy.ndimage.correlate1d(x, np.linalg.pinv(columns)[-1], axis=0, mode="wrap")
+    bend = np.maximum(t, 0.0) * BORDER_SAMPLES
+    weights = np.linalg.pinv(np.column_stack([t[:, None] ** np.arange(STEP_ORDER + 1), t > 0, bend]))
+    steps, bends = (scipy.ndimage.correlate1d(x, w, axis=0, mode="wrap") for w in weights[-2:])
+    return steps, bends
 
 
 def _change(x: np.ndarray, width: int) -> np.ndarray:

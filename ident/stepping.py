@@ -44,7 +44,7 @@ def with_steps(problem: Problem, result: Fit) -> tuple[Problem, Fit]:
 
 def told_by(before: Fit, after: Fit) -> bool:
     """Whether a fit in time steps explains what one without leaves, at most joints, and leaves hardly more than noise
-    there, and at most of those where that one leaves more."""
+    there, and at most of those where that one leaves more; where it leaves more at none, there is nothing to explain."""
     settled, left = after.costs <= SETTLED * after.counts, before.costs > DETECTION_EXCESS * before.counts
     most = 2 * int(np.sum(settled)) > len(settled) and 2 * int(np.sum(settled & left)) > int(np.sum(left))
     return told_by_most(before, after) and most

@@ -24,10 +24,10 @@ from ident.extended import predict
 from ident.group import Group
 from ident.hypotheses import catalogue
 from ident.hypotheses.friction import RESOLVED, other_turn, within
-from ident.identification import identify, set_up
+from ident.identification import identify, set_up, whitened
 from ident.model import Effect, Model, along_record
 from ident.output_noise import noise_covariance
-from ident.problem import data_counts, residual
+from ident.problem import data_counts, predictions, residual
 from ident.pruning import plainly_special
 from ident.records import build_groups, drift, with_turns_alike, without_creep
 from ident.refits import either_turn, refit
@@ -262,6 +262,14 @@ def test_a_single_period_that_ends_elsewhere_than_it_began_is_periodic_but_for_a
     assert drift((x + line)[:, None])[:, 0] == pytest.approx(line, abs=0.02 * far * drifts + 1e-12)
 
 
+@pytest.mark.parametrize("corner", [0, 1])
+def test_a_corner_where_a_period_begins_is_no_drift(corner):
+    """Of a triangle, and of a motion that begins with a jolt."""
+    t = np.arange(2000) / 2000
+    x = (np.abs(2.0 * t - 1.0), t * np.exp(-20.0 * t))[corner] + 1e-6 * np.random.default_rng(1).normal(size=2000)
+    assert not np.any(drift(x[:, None]))
+
+
 def settling(robot, seed, far):
     """One period of each experiment, over which the reference of a loop moves on by so many times its rms."""
     plan = small_plan(robot, seed, levels=(1.0,), period=1000, validation_points=0, injection="position")
@@ -282,6 +290,9 @@ def test_drives_are_right_where_a_single_period_drifts(ur10):
     assert all(g.drift is not None for g in setup.problem.groups)
     assert result.chi2_per_dof < 1.3
     assert result.model.par.stiffness == pytest.approx(ur10.array("stiffness"), rel=5e-3)
+    preds = predictions(setup.problem, result.model, result.remainders)
+    mean = np.concatenate([x[:, 0] for x in whitened(setup.problem, result, preds)])
+    assert np.sqrt(np.mean(np.abs(mean) ** 2)) < 1.5  # what the velocity takes stands there alone
 
 
 def test_a_drive_that_hunts_between_steps_of_its_encoder_does_not_creep():

@@ -154,9 +154,9 @@ class Hypothesis:
             shapes. ``holds`` names one that it holds and is asked for beside alone (``wider_forms``), from ``widens`` too,
             and ``narrow(p)`` gives parameters of the law of its own name that it holds.
             ``called(p, swing, stiffness)``: name, and names of parameters, of the special case that it is as good as at a
-            joint that swings so far beside a gear of that stiffness; None where it is not. ``apart``: the parameter that sets it apart from that special case, and ``special(p)`` the
-            parameters of the special case that it is where the data do not show this one, or where ``give(p)``, rad, is
-            less than the noise of the position. ``essential`` names the parameters without any of which nothing is left
+            joint that swings so far beside a gear of that stiffness; None where it is not. ``apart``: the parameter that
+            sets it apart from that special case, and ``special(p)`` the parameters of the special case that it is where
+            the data do not show this one, or where ``give(p)``, rad, is less than the noise of the position. ``essential`` names the parameters without any of which nothing is left
             of the effect, ``trivial(p, stiffness)`` says so of all parameters together, beside a gear of that
             stiffness. ``bends``: the arm may have several steady motions with it; ``bends(p, factor, stiffness)`` gives
             parameters of another size that do

@@ -25,7 +25,7 @@ from mujoco.batch import Batch
 
 from ident.graybox import hold_response
 from ident.group import Group
-from ident.inverse import Sampling, recorded_share
+from ident.inverse import Sampling, drifting_torque, recorded_share
 from ident.show.export import FRICTION_SLIP, PASSIVE_GROUP, TORQUE_OFFSET, stage_lead
 
 LOOP = 0.15  # frequency of the loop times the time by which torque lags what the loop sees, rad
@@ -181,6 +181,8 @@ def replay(arm: Arm, group: Group, sampling: Sampling) -> Replay:
             if change < REPEATS:
                 break
     assert U is not None
+    if group.drift is not None:
+        U = U + shift * drifting_torque(Z, group.drift)
     tracking = np.sqrt(np.mean((q - reference[:, ::m]) ** 2, axis=1))
     return Replay(U, tracking, change)
 
