@@ -1,5 +1,6 @@
 """Logs as programs write them: dates, rows of units, comments, brackets, quotes, structures, wrapped angles."""
 
+import time
 import tomllib
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import scipy.io
 
 from ident.convert import convert_logs
 from ident.convert.guess import guess_map
-from ident.convert.reading import list_signals, survey_log
+from ident.convert.layout import _words
+from ident.convert.reading import list_signals, read_log, survey_log
 from ident.convert.spelling import split_unit, unit_of
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
@@ -416,3 +418,18 @@ def test_a_log_without_signals_of_joints_is_told_as_before(tmp_path):
     log = written(tmp_path / "log.csv", {"t": T, "state": ["run"] * N, "position": Q[:, 0]})
     with pytest.raises(DataError, match="nothing that looks like a position or a torque of 6 joints"):
         guess_map([log], "ur10_bare")
+
+
+@pytest.mark.parametrize("delimiter", [None, "\t", ","])
+def test_long_runs_of_blanks_are_split_at_once(delimiter):
+    row = f"1{' ' * 200_000}2\n" if delimiter is None else f"1{delimiter}{' ' * 200_000}2\n"
+    start = time.perf_counter()
+    assert _words(row, delimiter) == ("1", "2")
+    assert time.perf_counter() - start < 1.0  # hundreds, if each blank is looked at from each
+
+
+@pytest.mark.parametrize("below", ["", "\n"])
+def test_a_header_alone_has_no_numbers(tmp_path, below):
+    (tmp_path / "log.csv").write_text(f"t,q{below}")
+    with pytest.raises(DataError, match="q without a number in it"):
+        read_log(tmp_path / "log.csv", {"q"})

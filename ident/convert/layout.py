@@ -82,7 +82,8 @@ def read_layout(path: Path, encoding: str = "") -> Layout:
     if any(len(r) >= LONGEST_LINE for r in (*comments, *rows)):
         raise DataError("log", str(path), f"a line of more than {LONGEST_LINE / 2**20:g} MB", "rows of numbers")
     rows = _whole_rows(rows)
-    lines = list(itertools.accumulate((r.count("\n") for r in rows), initial=skipped))  # before each row
+    # Before each row; the last of all may have no break at its end.
+    lines = list(itertools.accumulate((max(r.count("\n"), 1) for r in rows), initial=skipped))
     pairs = _pairs(rows)
     if pairs is not None:
         names, units, start = pairs
@@ -212,7 +213,9 @@ def _delimiter(first: str, second: str) -> str | None:
 
 def _words(line: str, delimiter: str | None) -> tuple[str, ...]:
     """Of one row, without quotes and breaks; a comment that is a header loses its sign."""
-    line = re.sub(r"\s*\n\s*", " ", line.strip(" \r\n") if delimiter == "\t" else line.strip())
+    line = line.strip(" \r\n") if delimiter == "\t" else line.strip()
+    if "\n" in line:  # of a cell in quotes; no pattern, which would look through long runs of blanks time and again
+        line = " ".join(p for part in line.split("\n") if (p := part.strip()))
     if delimiter is None:
         words = [m[1] or m[2] or m[3] or "" for m in WORD.finditer(line)]
     else:
