@@ -1,5 +1,7 @@
 """Structured arrays of NumPy, and structures of MATLAB and Simulink, as columns."""
 
+import time
+
 import h5py
 import numpy as np
 import pytest
@@ -167,3 +169,36 @@ def test_objects_of_a_class_are_said_to_be(tmp_path):
     assert "q_ts" not in list_signals(log) and "objects" in survey_log(log).doubts["q_ts"]
     with pytest.raises(DataError, match="q_ts is no array of numbers but of structures or objects: save their fields"):
         read_log(log, {"q_ts"})
+
+
+def test_large_arrays_of_structures_stand_beside_signals(tmp_path):
+    log = tmp_path / "log.mat"
+    with h5py.File(log, "w") as file:
+        file["q"] = Q[None, :]
+        part = file.create_dataset("#refs#/x", data=np.zeros((1, 5)))
+        group = file.create_group("#refs#/inner")
+        for k in range(25):
+            group[f"g{k}"] = TAU[None, :]
+            refs = np.array([[part.ref]] * 99 + [[group.ref]], h5py.ref_dtype)
+            file.create_dataset(f"runs/f{k}", data=refs, dtype=h5py.ref_dtype)
+    assert list(read_log(log, {"q"})) == ["q"]
+    assert np.array_equal(read_log(log, {"runs(100).f0.g24"})["runs(100).f0.g24"].ravel(), TAU)
+    assert {"q", "runs(1).f0", "runs(99).f24", "runs(100).f0.g24"} <= set(list_signals(log))
+
+
+def test_references_are_followed_up_to_a_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr("ident.convert.matlab.MOST_REFERRED", 2000)
+    log = tmp_path / "log.mat"
+    with h5py.File(log, "w") as file:
+        file["z"] = Q[None, :]
+        wide = file.create_group("#refs#/wide")
+        for k in range(5000):
+            wide[f"g{k}"] = h5py.SoftLink("/z")
+        for k in range(4):  # each leads to all of the next, and so to 100 million
+            name = "c" if k == 3 else f"#refs#/{k}"
+            below = wide if k == 0 else file[f"#refs#/{k - 1}"]
+            item = file.create_dataset(name, data=np.array([[below.ref]] * 100, h5py.ref_dtype), dtype=h5py.ref_dtype)
+            item.attrs["MATLAB_class"] = np.bytes_("cell")
+    start = time.perf_counter()
+    assert list(list_signals(log)) == ["z"] and list(read_log(log, {"z"})) == ["z"]
+    assert time.perf_counter() - start < 5.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from robot_assets.errors import DataError
 
 DEEPEST = 8  # structures inside structures that are looked into
 MOST_ITEMS = 2000  # groups and arrays of one file, each of which takes time to look at
+MOST_REFERRED = 20_000  # of those that cells and arrays of structures refer to, 200 fields of each of the most elements
 MOST_ELEMENTS = 100  # of an array of structures or cells, as many as joints or runs; more of them are samples
 LONGEST_NAME = 200  # characters
 OBJECT = np.zeros((), [("object", bool)])  # stands for one of a class, as of timeseries, which only MATLAB reads
@@ -117,15 +118,22 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
     found: dict[str, Any] = {}
     texts: dict[str, np.ndarray] = {}
     objects: dict[str, np.ndarray] = {}
-    groups, items = set(), 0
+    groups, items, followed = set(), 0, 0
 
-    def look_at(item: Any, name: str, depth: int) -> None:
+    def referred(item: Any) -> list[Any] | None:
+        nonlocal followed
+        parts = None if followed >= MOST_REFERRED else _referred(file, item)
+        followed += len(parts or ())
+        return parts
+
+    def look_at(item: Any, name: str, depth: int, within: bool) -> None:
+        """``within``: what something refers to, of which only as much as is bound is looked at."""
         nonlocal items
-        items += 1
+        items += not within
         if items > MOST_ITEMS:
             raise DataError("log", str(path), f"more than {MOST_ITEMS} groups and arrays", "a recording")
         if isinstance(item, h5py.Group):
-            walk(item, f"{name}.", depth + 1)
+            walk(item, f"{name}.", depth + 1, within)
         elif not isinstance(item, h5py.Dataset):
             return
         elif "MATLAB_object_decode" in item.attrs:
@@ -134,35 +142,41 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
             text = item.attrs.get("MATLAB_class", b"") == b"char"
             if (wanted is None or name in wanted) and not text and not item.attrs.get("MATLAB_empty", 0):
                 found[name] = item
-        elif (parts := _referred(file, item)) is None:
-            return
-        elif (cells := _texts(parts)) is not None:
-            if wanted is None:
-                texts[name] = cells
-        elif depth <= DEEPEST:
+        elif len(name) <= DEEPEST * LONGEST_NAME:  # else the names of all parts would take much memory
             # Cells say what they are; what does not is a field of an array of structures.
-            cell = item.attrs.get("MATLAB_class", b"") == b"cell"
             start, _, key = name.rpartition(".")
-            for k, part in enumerate(parts):
-                look_at(part, f"{name}{{{k + 1}}}" if cell or not start else f"{start}({k + 1}).{key}", depth + 1)
+            cell = item.attrs.get("MATLAB_class", b"") == b"cell" or not start
+            before, after = (f"{name}{{", "}") if cell else (f"{start}(", f").{key}")
+            if not _wanted_within(wanted, before, after) or (parts := referred(item)) is None:
+                return
+            if (cells := _texts(parts)) is not None:
+                if wanted is None:
+                    texts[name] = cells
+            elif depth <= DEEPEST:
+                for k, part in enumerate(parts):
+                    look_at(part, f"{before}{k + 1}{after}", depth + 1, True)
 
-    def walk(group: Any, start: str, depth: int) -> None:
+    def walk(group: Any, start: str, depth: int, within: bool) -> None:
+        nonlocal followed
         address = h5py.h5o.get_info(group.id).addr
         if depth > DEEPEST or address in groups:  # a group may hold itself
             return
         groups.add(address)
-        labelled, others = _labelled(file, group) if depth else ({}, {})
+        labelled, others = _labelled(group, referred) if depth and _wanted_within(wanted, start) else ({}, {})
         for label, item in (labelled | (others if wanted is None else {})).items():
-            look_at(item, f"{start}{label}", depth)
+            look_at(item, f"{start}{label}", depth, True)
         for name in group:
+            followed += within
+            if within and followed > MOST_REFERRED:
+                return
             # Where MATLAB keeps what cells hold; and links, which may lead out of the file.
             if (name.startswith("#") and not start) or not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 continue
             if wanted is None and name == SIGNALS and (labelled or others):
                 continue  # each once, by its label if it has one
-            look_at(group[name], f"{start}{name}", depth)
+            look_at(group[name], f"{start}{name}", depth, within)
 
-    walk(file, "", 0)
+    walk(file, "", 0, False)
     for name, item in found.items():
         if item.external or item.is_virtual:
             raise DataError("signal", str(path), f"{name}, which stands in another file", "one in the file itself")
@@ -171,14 +185,19 @@ def _hdf5(path: Path, file: Any, wanted: set[str] | None) -> dict[str, Any]:
     return texts | objects | {name: _flat(np.asarray(item).T) for name, item in found.items()}
 
 
+def _wanted_within(wanted: set[str] | None, before: str, after: str = "") -> bool:
+    """Whether a name that is wanted can be that of a part: it begins with one text, and has another behind it."""
+    return wanted is None or any(w.startswith(before) and after in w[len(before) :] for w in wanted)
+
+
 def _flat(x: np.ndarray) -> np.ndarray:
     """An array without dimensions of one, where it has more than two: Simulink has time in the third."""
     return np.squeeze(x) if x.ndim > 2 else x
 
 
-def _labelled(file: Any, group: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+def _labelled(group: Any, referred: Callable[[Any], list[Any] | None]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Label -> values of the signals of a structure with time, and name -> values of those without one; empty where it
-    is none."""
+    is none. ``referred``: what an array refers to."""
     import h5py
 
     signals = group.get(SIGNALS) if isinstance(group.get(SIGNALS, getlink=True), h5py.HardLink) else None
@@ -187,7 +206,7 @@ def _labelled(file: Any, group: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         for key in ("values", "label")
     ):
         return {}, {}
-    values, texts = _referred(file, signals["values"]), _referred(file, signals["label"])
+    values, texts = referred(signals["values"]), referred(signals["label"])
     if values is None or texts is None:  # one signal stands there itself
         values, texts = [signals["values"]], [signals["label"]]
     labels = _distinct_labels([_text(x) or "" for x in texts], list(group))
@@ -204,8 +223,8 @@ def _referred(file: Any, item: Any) -> list[Any] | None:
     if item.dtype != h5py.ref_dtype or item.external or item.is_virtual or not 0 < item.size <= MOST_ELEMENTS:
         return None
     # MATLAB counts along its first dimension, the file's last.
-    parts = [file[ref] if ref else None for ref in np.asarray(item).ravel()]
-    return None if any(p is None for p in parts) else parts
+    refs = np.asarray(item).ravel()
+    return [file[ref] for ref in refs] if all(refs) else None
 
 
 def _texts(parts: list[Any]) -> np.ndarray | None:
