@@ -142,15 +142,19 @@ def test_the_command_takes_an_encoding_for_a_guess_alone(tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize("minus", ["-", "\u2212", "\uff0d"])
-@pytest.mark.parametrize("between", ["\u00a0", "\u202f", "\u2009", "\u2007", "'", "\u2019"])
+@pytest.mark.parametrize("between", ["\u00a0", "\u202f", "\u2009", "\u2007", "'", "\u2019", "thousands"])
 @pytest.mark.parametrize(("delimiter", "decimal"), [(";", ","), (",", "."), ("\t", "."), (" ", ".")])
 def test_typeset_numbers_are_read(tmp_path, minus, between, delimiter, decimal):
+    between = {",": ".", ".": ","}[decimal] if between == "thousands" else between
+
     def cell(x):
-        return f"{1e6 * x:,.2f}".replace(",", between).replace(".", decimal).replace("-", minus)
+        text = f"{1e6 * x:,.2f}".replace(".", "_").replace(",", between).replace("_", decimal).replace("-", minus)
+        return f'"{text}"' if delimiter == between else text
 
     log = written(tmp_path, delimiter.join(("t", "q", "tau")), cell=cell, delimiter=delimiter)
     if decimal == ",":
-        log.write_text(log.read_text(encoding="utf-8").replace(".", ","), encoding="utf-8")
+        cells = (line.partition(";") for line in log.read_text(encoding="utf-8").splitlines(keepends=True))
+        log.write_text("".join(t.replace(".", ",") + ";" + x for t, _, x in cells), encoding="utf-8")
     found = read_log(log, {"t", "q", "tau"})
     assert np.array_equal(found["q"], np.round(1e6 * X, 2)) and np.array_equal(found["t"], T)
     survey = survey_log(log)

@@ -111,11 +111,14 @@ class Cells:
     def _any_numbers(self, column: pa.Array) -> np.ndarray:
         """Numbers, typeset ones too: these are asked for where the first is met, as it takes time."""
         if not self.typeset:
+            state = self.comma, self.dot, self._grouped, self._shown, self._pointed
             try:
                 return self._numbers(column)
             except (pa.ArrowInvalid, ValueError):
                 if plain_numbers(column) is column:
                     raise
+                # What the first try took for decimals may be thousands behind a minus that it did not know.
+                self.comma, self.dot, self._grouped, self._shown, self._pointed = state
                 self.typeset = True
         return self._numbers(plain_numbers(column))
 
