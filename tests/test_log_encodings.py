@@ -2,14 +2,15 @@
 
 import itertools
 import sys
+import time
 
 import numpy as np
 import pytest
 
 from ident.cli import main
 from ident.convert import convert_logs
-from ident.convert.encoding import encoding_of
 from ident.convert.guess import guess_map
+from ident.convert.layout import read_layout
 from ident.convert.reading import read_log, survey_log
 from robot_assets.errors import DataError
 
@@ -68,9 +69,42 @@ def test_western_letters_and_marks_tell_the_encoding(tmp_path, header, encoding)
         header = header.replace("–", "-")
     log = written(tmp_path, f"{header},t", encoding)
     told = {"latin-1": "cp1252", "utf-8": "utf-8"}.get(encoding, encoding)
-    assert encoding_of(log) == told
+    layout = read_layout(log)
+    assert layout.encoding == told and not layout.unsure
     assert list(survey_log(log).signals) == [*header.split(","), "t"]
     assert survey_log(log).encoding == ("" if told == "utf-8" else told)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Drehmoment × 10", "Kraft ½", "[×]", "Temp été", "pää", "a«b»", "§ 3", "q¹", "Rotação", "Öl ¼", "Größe (±1)"],
+)
+def test_western_signs_and_words_with_few_letters_of_ascii(tmp_path, name):
+    log = written(tmp_path, f"t,{name},tau", "cp1252")
+    assert list(survey_log(log).signals) == ["t", name, "tau"] and survey_log(log).encoding == "cp1252"
+
+
+@pytest.mark.parametrize("cell", ["5 × 3", "ÄÜÄ", "‰«»", "位置"])
+def test_texts_below_the_names_tell_no_encoding(tmp_path, cell):
+    rows = "".join(f"{t},{x},{cell if k else 'a'}\n" for k, (t, x) in enumerate(zip(T, X, strict=True)))
+    (tmp_path / "log.csv").write_bytes(
+        "t,Größe,note\n".encode("cp1252") + rows.encode("gb18030" if cell == "位置" else "cp1252")
+    )
+    assert list(survey_log(tmp_path / "log.csv").signals) == ["t", "Größe"]
+
+
+def test_a_doubtful_name_shows_its_western_reading(tmp_path):
+    # The two letters are a common word of Chinese.
+    log = written(tmp_path, "t,DREHMOMENT_ÄÜ,tau", "cp1252")
+    with pytest.raises(DataError, match=r"'DREHMOMENT_能' in gb18030, .*'DREHMOMENT_ÄÜ' in cp1252"):
+        guess_map([log], "twomass")
+
+
+@pytest.mark.parametrize("end", ["le", "be"])
+def test_utf_16_without_a_mark_may_be_stated_by_its_plain_name(tmp_path, end):
+    log = written(tmp_path, "t,位置,tau", f"utf-16-{end}")
+    for stated in ("", "utf-16", "UTF16", f"utf-16-{end}"):
+        assert np.array_equal(read_log(log, {"位置"}, encoding=stated)["位置"], X)
 
 
 @pytest.mark.parametrize("encoding", ["shift_jis", "gb18030", "big5", "euc_kr"])
@@ -81,7 +115,7 @@ def test_characters_of_two_bytes_are_no_western_letters(tmp_path, encoding):
     words = ("각도", "위치", "속도", "전류", "시간", "축", "값") if encoding == "euc_kr" else words
     for word, name in itertools.product(words, ("{}", "q{}", "motor{}", "{} [rad]", "J1{}", "motor {}")):
         (tmp_path / "log.csv").write_bytes(f"t,{name.format(word)}\n0,1\n".encode(encoding))
-        assert encoding_of(tmp_path / "log.csv") == "", name.format(word)
+        assert read_layout(tmp_path / "log.csv").unsure, name.format(word)
 
 
 def test_names_in_ascii_need_no_encoding(tmp_path):
@@ -109,12 +143,12 @@ def test_files_of_a_log_may_have_encodings_of_their_own(tmp_path):
         ("base64", "encoding: .*found 'base64', expected an encoding"),
         ("utf-8", "encoding: .*found bytes that are no utf-8 in line 1, .*this may be '時間 .s.' in shift_jis"),
         ("utf-16", "encoding: .*found bytes that are no utf-16 in line 1"),
+        ("utf-32", "encoding: .*found bytes that are no utf-32 in line 1"),
+        ("idna", "encoding: .*found 'idna', expected an encoding"),
     ],
 )
 def test_an_encoding_that_cannot_be_is_one_clear_error(tmp_path, encoding, found):
     log = written(tmp_path, HEADERS["shift_jis"], "shift_jis")
-    if encoding == "utf-16":
-        log.write_bytes(log.read_bytes()[:30] + b"\x00\xdc\x00\xdc" + log.read_bytes()[30:])
     with pytest.raises(DataError, match=found) as caught:
         converted(log, mapped(("t", "q", "tau"), f'encoding = "{encoding}"'), tmp_path)
     assert "\n" not in str(caught.value)
@@ -212,3 +246,11 @@ def test_quotes_that_belong_to_no_cell_take_no_rows(tmp_path, monkeypatch, piece
     lines = ["t,q,note", *(f"{t:.2f},{x},{note if k % 7 == 0 else ''}" for k, (t, x) in enumerate(zip(T, X)))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
     assert np.array_equal(read_log(tmp_path / "log.csv", {"q"})["q"], X)
+
+
+def test_the_readings_of_a_long_name_take_no_time(tmp_path):
+    (tmp_path / "log.csv").write_bytes(b"t,q" + b"x" * 60_000 + " 位置\n0,1\n".encode("gb18030"))
+    start = time.perf_counter()
+    with pytest.raises(DataError, match=r"no UTF-8, .*in gb18030"):
+        survey_log(tmp_path / "log.csv")
+    assert time.perf_counter() - start < 2.0

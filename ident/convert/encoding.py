@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from robot_assets.errors import DataError
@@ -18,7 +19,7 @@ MARKS = {
 }
 # What programs write under these names has more characters than the standard: circled digits, units in one sign.
 WIDER = {"shift_jis": "cp932", "gb2312": "gb18030", "gbk": "gb18030", "euc_kr": "cp949", "utf-8": "utf-8-sig"}
-SHOWN = ("shift_jis", "gb18030", "big5", "euc_kr", "cp1251")  # readings that an error shows, of those that can be
+SHOWN = ("shift_jis", "gb18030", "big5", "euc_kr", "cp1251", "cp1252")  # readings of an error, of those that can be
 LONGEST_READING = 24  # characters of one
 
 # Bytes of cp1252 as Latin-1 has them: letters, and signs of units and numbers.
@@ -26,7 +27,17 @@ LETTERS = "À-ÖØ-öø-ÿ"
 SIGNS = "°º²³µ·±\xa0"
 # Punctuation between blanks, where no character of two bytes can begin or end.
 PUNCTUATION = re.compile("(?<![\x80-\xff])[\x80\x85\x91-\x97\x99](?=[\\s!-/]|$)")
+# Others, which are signs only where no byte above ASCII is beside them.
+ALONE = re.compile(f"(?<![\x80-\xff])(?![{SIGNS}])[\xa1-\xbf×÷](?![\x80-\xff])")
 WORDS = re.compile(f"[A-Za-z{LETTERS}]+")
+
+# Bytes of the characters in common use: the first level of each standard, and syllables.
+COMMON = {
+    "cp932": rb"[\x81-\x83\x88-\x97].",
+    "gb18030": rb"[\xa1-\xa9\xb0-\xd7][\xa1-\xfe]",
+    "big5": rb"[\xa1-\xc6].",
+    "cp949": rb"[\xa1-\xac\xb0-\xc8][\xa1-\xfe]",
+}
 
 
 def known_encoding(name: str, key: str, where: str) -> str:
@@ -36,7 +47,7 @@ def known_encoding(name: str, key: str, where: str) -> str:
         DataError: where Python knows none of that name, or it is none of texts.
     """
     try:
-        if "1,2\n".encode(name).decode(name) == "1,2\n":
+        if "1,2\n".encode(name).decode(name, errors="replace") == "1,2\n":
             return name
     except (LookupError, ValueError):
         pass
@@ -44,7 +55,7 @@ def known_encoding(name: str, key: str, where: str) -> str:
 
 
 def encoding_of(path: Path, stated: str = "") -> str:
-    """The encoding by which Python reads a text; empty where its bytes do not tell, and none is stated.
+    """The encoding by which Python reads a text; empty where it is not stated, and no mark of it tells.
 
     Raises:
         DataError: where the text is none of the encoding that is stated.
@@ -56,6 +67,8 @@ def encoding_of(path: Path, stated: str = "") -> str:
         name = codecs.lookup(stated).name
         # Of an encoding that is stated without it a mark would be part of the first name.
         name = marked if marked and marked[:6] == name[:6] else WIDER.get(name, name)
+        if name == "utf-16" and not marked:
+            name = _wide(head) or name
         bad = _undecoded(head, name)
         if bad is not None:
             found = f"bytes that are no {stated} in line {head[:bad].count(10) + 1}"
@@ -63,13 +76,31 @@ def encoding_of(path: Path, stated: str = "") -> str:
         return name
     if marked:
         return marked
-    for start, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):  # without a mark: every other byte of a table is zero
+    wide = _wide(head)
+    if wide:
+        return wide
+    if _undecoded(head, "utf-8") is None:
+        return "utf-8"
+    return ""
+
+
+def western(path: Path, names: Sequence[str]) -> bool:
+    """Whether a text whose bytes tell no encoding is of Western letters, by the names and units of its columns, as
+    Latin-1: texts below them may hold anything. Where these are plain ASCII, its first bytes tell."""
+    with path.open("rb") as file:
+        head = file.read(LOOKED_AT)
+    if _undecoded(head, "cp1252") is not None:
+        return False
+    return _western("\t".join((*names, "")) if not all(map(str.isascii, names)) else head.decode("latin-1"))
+
+
+def _wide(head: bytes) -> str:
+    """Which UTF-16 a table without a mark is, of which every other byte is zero; empty where it is none."""
+    for start, encoding in ((1, "utf-16-le"), (0, "utf-16-be")):
         half = head[start::2]
         if len(half) > 8 and half.count(0) > 0.9 * len(half):
             return encoding
-    if _undecoded(head, "utf-8") is None:
-        return "utf-8"
-    return "cp1252" if _western(head.decode("latin-1")) else ""
+    return ""
 
 
 def unreadable(path: Path, name: str) -> DataError:
@@ -86,8 +117,8 @@ def _undecoded(head: bytes, encoding: str) -> int | None:
     """The first byte that is none of an encoding; None where all are. The last character may be cut."""
     try:
         codecs.getincrementaldecoder(encoding)().decode(head)
-    except UnicodeDecodeError as err:
-        return err.start
+    except UnicodeError as err:  # a mark that is missing has no place
+        return err.start if isinstance(err, UnicodeDecodeError) else 0
     return None
 
 
@@ -95,23 +126,39 @@ def _western(text: str) -> bool:
     """Whether bytes above ASCII, read as Latin-1, are letters within words of ASCII and signs that stand alone.
 
     Characters of two bytes come as several of such in a row, or as capitals behind small letters; words of other
-    alphabets have no letters of ASCII.
+    alphabets have no letters of ASCII. Words with few of them, and signs that are rarer, are Western where the bytes
+    have no East Asian reading with a character that is in common use.
     """
     text = PUNCTUATION.sub(" ", text)
+    plain = ALONE.sub(" ", text)
     if re.search(
-        f"[^\x00-\x7f{LETTERS}{SIGNS}]|[{SIGNS}][{LETTERS}{SIGNS}]|[{LETTERS}][{SIGNS}]|[a-zß-öø-ÿ][À-ÖØ-Þ]", text
+        f"[^\x00-\x7f{LETTERS}{SIGNS}]|[{SIGNS}][{LETTERS}{SIGNS}]|[{LETTERS}][{SIGNS}]|[a-zß-öø-ÿ][À-ÖØ-Þ]", plain
     ):
         return False
     strange = re.compile(f"[{LETTERS}]")
-    return all(
-        len(word) == 1 or 2 * len(strange.findall(word)) <= len(word)
-        for word in WORDS.findall(text)
-        if not word.isascii()
+    shares = [len(strange.findall(w)) / len(w) for w in WORDS.findall(plain) if len(w) > 1 and not w.isascii()]
+    if all(x <= 1 / 2 for x in shares) and plain == text:
+        return True
+    return all(x <= 2 / 3 for x in shares) and not any(_common(text.encode("latin-1"), name) for name in COMMON)
+
+
+def _common(text: bytes, encoding: str) -> bool:
+    """Whether bytes can be of an East Asian encoding, and one of its characters in common use is among them."""
+    try:
+        read = codecs.getincrementaldecoder(encoding)().decode(text)
+    except UnicodeDecodeError:
+        return False
+    # Signs for syllables may stand in one byte, but hardly one by itself.
+    return re.search("[\uff66-\uff9f]{2}", read) is not None or any(
+        re.fullmatch(COMMON[encoding], ch.encode(encoding), re.DOTALL) for ch in set(read) if not ch.isascii()
     )
 
 
 def _readings(head: bytes) -> str:
     """How the first bytes above ASCII read in encodings that they can be of, in words; empty where none can."""
+    first = re.search(rb"[\x80-\xff]", head)
+    # No more before it than is shown: a pattern would look through a long text from each of its characters.
+    head = head[max(first.start() - LONGEST_READING, 0) :] if first else b""
     word = re.search(rb"[^\x00-\x20,;\"]*[\x80-\xff][^\t\r\n,;\"]*", head)
     if word is None:
         return ""

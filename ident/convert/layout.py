@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 
 from ident.convert.dates import is_date
-from ident.convert.encoding import encoding_of
+from ident.convert.encoding import encoding_of, western
 from ident.convert.numerals import SPACES, plain_number
 from ident.convert.spelling import unit_of
 from robot_assets.errors import DataError
@@ -64,7 +64,13 @@ def read_layout(path: Path, encoding: str = "") -> Layout:
         DataError: where a line is too long for a table, or the text is none of the encoding.
     """
     told = encoding_of(path, encoding)
-    encoding, unsure = told or "latin-1", not told
+    layout = _read_layout(path, told or "latin-1", not told)
+    # Read once more, as signs that Latin-1 lacks may have been lost about the names.
+    return _read_layout(path, "cp1252", False) if not told and western(path, layout.names + layout.units) else layout
+
+
+def _read_layout(path: Path, encoding: str, unsure: bool) -> Layout:
+    """As ``read_layout``, of an encoding that is known, or taken until names tell it."""
     comments: deque[str] = deque(maxlen=2)
     skipped, looked_at = 0, 0
     with path.open(encoding=encoding, errors="replace", newline=None) as file:

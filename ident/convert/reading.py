@@ -41,7 +41,8 @@ class Survey:
         cut: rows that were read of a log that is longer; else 0.
         labels: name -> distinct texts of a column that has few.
         lists: name -> strings of a list of them, which may name columns; empty where it changes from row to row.
-        encoding: of a text, as stated or as its bytes tell; empty of UTF-8 without a mark.
+        encoding: of a text, as stated or as its bytes tell; Latin-1 where they do not, and no name needs it; empty of
+            UTF-8 without a mark.
     """
 
     signals: Signals
