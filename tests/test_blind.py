@@ -122,9 +122,7 @@ def test_a_motor_whose_iron_saturates_is_not_one_that_is_clipped(tmp_path, clipp
         def deliver(self, run):
             return lambda u, step: np.clip(u, -0.8, 0.8) if clipped else 1.6 * np.tanh(u / 1.6)
 
-    data = quick_experiment(
-        small_plan(robot, 3, period=1000, levels=(1.6, 0.8)), [Curve(robot.joint_names[0])], seed=3
-    )
+    data = quick_experiment(small_plan(robot, 3, period=1000, levels=(1.6, 0.8)), [Curve(robot.joint_names[0])], seed=3)
     assert 1.3 < max(np.abs(s.tau).max() for s in data.segments) < 1.6
     verdict = diagnose(through_files(data, tmp_path))
     named = [c.effect for c in verdict.causes if c.probability > 0.5]

@@ -1730,9 +1730,19 @@ def test_a_ripple_once_or_twice_in_a_turn_of_the_motor_is_not_charged_for_its_pe
     assert not any("usual" in x.options for x in bench) and "usual" in h.options
 
 
-@pytest.mark.parametrize(("value", "spread"), [(0.97, -np.log(0.97)), (1.03, np.log(1.03)), (4.9, LOG_SPREAD)])
-def test_a_factor_is_as_large_as_it_differs_from_none(value, spread):
-    """Charged for all sizes that it may have, a torque constant that is slightly off had lost against a load."""
+@pytest.mark.parametrize(
+    ("value", "spread"),
+    [
+        (0.97, -np.log(0.97)),
+        (1.03, np.log(1.03)),
+        (np.exp(-0.075), np.sqrt(0.075 * LOG_SPREAD)),
+        (1.11, LOG_SPREAD),
+        (4.9, LOG_SPREAD),
+    ],
+)
+def test_a_factor_that_is_slightly_off_is_as_large_as_it_differs_from_none(value, spread):
+    """Charged for all sizes that it may have, a torque constant that is 3 % off had lost against a load; charged for
+    its own alone, one that is 9 % off had won against friction."""
     q = Parameter("scale", "1", 0.2, 5.0, log=True, null=1.0)
     assert q.expected_spread(value) == pytest.approx(spread)
     assert replace(q, null=None).expected_spread(value) == LOG_SPREAD

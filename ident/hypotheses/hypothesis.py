@@ -11,6 +11,7 @@ import numpy as np
 from ident.hypotheses.yielding import SLIP
 from ident.motion import Motion
 
+TOLERANCE = 0.05  # of a factor, natural logarithm, that needs no cause; twice as much does
 LOG_SPREAD = 1.5  # of a positive parameter before the data, natural logarithm
 UNIT_RANGE = 4.0  # between bounds that are physical ones of a pure number
 
@@ -74,11 +75,13 @@ class Parameter:
 
     def expected_spread(self, value: float) -> float:
         """Standard deviation before the data that a value is charged for, fitted coordinates: ``spread_allowed``, and of
-        a factor no more than that by which it differs from none."""
+        a factor that differs little from none, as that of any motor does, no more than that; in between beyond."""
         allowed = self.spread_allowed(value)
         if not self.log or self.null is None or np.isfinite(self.spread):
             return allowed
-        return min(abs(self.to_internal(value) - self.to_internal(self.null)), allowed)
+        off = abs(self.to_internal(value) - self.to_internal(self.null))
+        beyond = float(np.clip(off / TOLERANCE - 1.0, 0.0, 1.0))
+        return min(off ** (1.0 - beyond) * allowed**beyond, allowed)
 
     def spread_allowed(self, value: float) -> float:
         """Standard deviation before the data, fitted coordinates: of the size of the value where nothing is said."""
