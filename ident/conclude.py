@@ -134,11 +134,12 @@ def conclude(found: Findings) -> Verdict:
     """Put what was found into the words and numbers of verdict.json."""
     dataset, result = found.dataset, found.result
     tones = of_their_own(found.tones, found.final)
-    direct = seen_in_samples(found)
+    refuted = is_refuted(found)
+    remains = cause_remains(found, refuted)
+    direct = seen_in_samples(found, remains)
     nameless = bool(tones) or any(x.many for x in found.lost)
     alone = nameless and not result.detected and not direct
-    refuted = is_refuted(found)
-    unknown = cause_remains(found, refuted) or alone
+    unknown = remains or alone
     detected = result.detected or bool(direct) or alone
     causes = (*named_causes(found, refuted), *direct)
     values, undetermined = parameters_of(found)
@@ -252,11 +253,10 @@ def trust_in(effect: Effect, of_effect: Round, found: Findings, doubted: bool, c
     return trust * known_probability(1.0, True) if doubtful else trust
 
 
-def seen_in_samples(found: Findings) -> tuple[Cause, ...]:
-    """Causes that the samples themselves show, and no fit."""
+def seen_in_samples(found: Findings, remains: bool) -> tuple[Cause, ...]:
+    """Causes that the samples themselves show, and no fit; ``remains`` as of ``_late``."""
     joints, linear = found.dataset.joints, linear_names(found.dataset.robot)
     rounded = (_rounded(x, joints[x.joint], linear) for x in found.setup.steps)
-    remains = bool(found.late) and cause_remains(found, is_refuted(found))
     return (*rounded, *(_late(x, joints[x.joint], remains) for x in found.late))
 
 

@@ -159,12 +159,12 @@ class Hypothesis:
             ``called(p, swing, stiffness)``: name, and names of parameters, of the special case that it is as good as at a
             joint that swings so far beside a gear of that stiffness; None where it is not. ``apart``: the parameter that
             sets it apart from that special case, and ``special(p)`` the parameters of the special case that it is where
-            the data do not show this one, or where ``give(p)``, rad, is less than the noise of the position. ``essential`` names the parameters without any of which nothing is left
-            of the effect, ``trivial(p, stiffness)`` says so of all parameters together, beside a gear of that
-            stiffness. ``bends``: the arm may have several steady motions with it; ``bends(p, factor, stiffness)`` gives
-            parameters of another size that do
-            about the same. ``dry``: a friction that at rest balances what is asked of it; ``sees_load``: of a size that
-            the torque of the gear says.
+            the data do not show this one, or where ``give(p)``, rad, is less than the noise of the position.
+            ``essential`` names the parameters without any of which nothing is left of the effect,
+            ``trivial(p, stiffness)`` says so of all parameters together, beside a gear of that stiffness. ``bends``: the
+            arm may have several steady motions with it; ``bends(p, factor, stiffness)`` gives parameters of another size
+            that do about the same. ``dry``: a friction that at rest balances what is asked of it; ``sees_load``: of a
+            size that the torque of the gear says.
             ``usual(p)``: values by name of the parameter that need no data to be expected, next to those that it has.
             ``nats(p)``: log odds before the data, where there is a reason for any. ``of_size(p)``: factor of the spreads
             that are expected of its parameters. ``body``: the link whose inertia it
