@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.arbitration import weighed_on_held_out
 from ident.attribute import Attribution
 from ident.conclude import Findings, conclude
 from ident.dataset import Dataset
@@ -94,6 +95,8 @@ def diagnose_fully(
     say("gain on held-out data")
     belied = {r.candidates[0].hypothesis.key for r in sought.result.rounds if denied(problem, setup.held_out, r)}
     kept, notes = without_denied(problem, sought.result, belied)
+    kept, weighed = weighed_on_held_out(problem, setup.held_out, kept, workers)
+    notes += weighed
     result, test, more = tested(
         sought, kept, first, "validation segments" if dataset is given else END_HELD_OUT, workers
     )
