@@ -179,7 +179,7 @@ def predict_at(
     if W is not None and W.shape[-1] != structure.n_coordinates:
         W, steps, torques = None, max(steps, REMAINDER_STEPS), Torques()
     filtered = any("filter" in e.hypothesis.options for e in model.effects)
-    Q = true_position(group, par, sampling, partial(passed_by_filters, model) if filtered else None)
+    Q = true_position(group, par, plane, sampling, partial(passed_by_filters, model) if filtered else None)
     by_channel: dict[str, list[Effect]] = {}
     for effect in model.effects:
         by_channel.setdefault(effect.hypothesis.channel, []).append(effect)

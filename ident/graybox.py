@@ -177,6 +177,10 @@ def damping_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
 # of a held torque on either side, that drives and sensors may change; each of the next has a seven-hundredth of the
 # first at most
 IMAGES = 8
+NEAR_IMAGES = (
+    3  # the same, that stiff gears carry to the links; each of the next has a two-hundredth of the first at most
+)
+STIFF = 0.2  # resonance of a motor on its gear over the sample rate, from which it is no bare inertia to them
 
 
 def hold_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarray:
@@ -198,7 +202,8 @@ def alias_response(
     The spectrum of a held torque has images about multiples of the sample rate. Far above its
     resonances every motor is its bare inertia, so what the images add after sampling is that of a
     double integrator: its exact sampled response ``T^2 (z + 1) / (2 (z - 1)^2)`` less its
-    baseband part. The error left is of the order of (resonance / sample rate)^2 of this term.
+    baseband part. The error left is of the order of (resonance / sample rate)^2 of this term
+    (``stiff_gear_images`` where that is much).
 
     Args:
         passed: what drives and sensors let pass at complex frequencies (F,), rad/s; (F, n). The result is (F, n) then.
@@ -214,11 +219,38 @@ def alias_response(
     out[omega > 0] = exact + hold_response(w, sample_time, hold) / w**2
     if passed is None:
         return out
-    order = np.concatenate([np.arange(-IMAGES, 0), np.arange(1, IMAGES + 1)])
-    image = omega[:, None] + order * (2 * np.pi / sample_time)
+    image = images_of(omega, sample_time, IMAGES)
     each = -hold_response(image, sample_time, hold) / image**2
     factor = passed(1j * image.ravel()).reshape(*image.shape, -1)
     return out[:, None] + np.einsum("fm,fmn->fn", each, factor - 1.0)
+
+
+def stiff_gear_images(
+    structure: Structure, par: Parameters, lin: Linearisation, omega: np.ndarray, sample_time: float, hold: str
+) -> np.ndarray | None:
+    """What ``alias_response`` lacks where gears are stiff: position per recorded torque that each of the nearest images
+    adds beyond that of bare motors; (F, images, n, n) rad/(N m), or None where all gears are soft to them.
+
+    A gear whose resonance is above the sample rate turns the link at the images too.
+    """
+    gears = np.sqrt(np.maximum(par.stiffness / par.inertia, 0.0))
+    if hold == "none" or not np.any(gears > STIFF * 2 * np.pi / sample_time):
+        return None
+    image = images_of(omega, sample_time, NEAR_IMAGES)
+    far = image.ravel()
+    if lin.M.ndim == 3:  # of a posture at each frequency
+        lin = replace(lin, M=np.repeat(lin.M, image.shape[1], axis=0), Kg=np.repeat(lin.Kg, image.shape[1], axis=0))
+    Y = np.linalg.inv(impedance(structure, par, lin, 1j * far)[0])
+    k = np.arange(structure.n)
+    Y[:, k, k] += 1.0 / (far[:, None] ** 2 * par.inertia)
+    more = hold_response(far, sample_time, hold)[:, None, None] * Y
+    return more.reshape(*image.shape, structure.n, structure.n)
+
+
+def images_of(omega: np.ndarray, sample_time: float, most: int) -> np.ndarray:
+    """(F, 2 most) rad/s, the nearest images of frequencies of a held torque, on either side."""
+    order = np.concatenate([np.arange(-most, 0), np.arange(1, most + 1)])
+    return omega[:, None] + order * (2 * np.pi / sample_time)
 
 
 def impedance(
@@ -287,6 +319,9 @@ def sampled_frf(
     gain = (H0 * s**2)[:, None, None]
     G = gain * Y
     G[:, k, k] += (s**2 * alias)[:, None] / par.inertia
+    more = stiff_gear_images(structure, par, lin, omega, sample_time, hold)
+    if more is not None:
+        G += (s**2)[:, None, None] * np.sum(more, axis=1)
     if not derivatives:
         return G, None
     left, right = impedance_derivatives(structure, par, s, A_inv, C)

@@ -10,6 +10,7 @@ import scipy.linalg
 from ident.chain import LinkChange, build_structure
 from ident.graybox import Parameters, alias_response, equilibrium, hold_response, linearise, sampled_frf
 from ident.hypotheses import catalogue
+from ident.inverse import make_plane, true_position
 from robot_assets.robot import Elasticity, load_robot
 
 Q0 = np.array([0.2, -1.2, 0.9, 0.1, 0.5, 0.3])
@@ -53,9 +54,12 @@ def test_two_masses_have_the_textbook_resonances():
     assert f[np.argmax(G)] == pytest.approx(np.sqrt(k * (1 / J_m + 1 / J_l)) / 2 / np.pi, abs=0.02)
 
 
-def test_sampling_is_exact(ur10):
-    """Against the matrix exponential of the state-space form under a zero-order hold."""
+@pytest.mark.parametrize("stiffer", [1.0, 100.0, 1e3, 1e6])
+def test_sampling_is_exact(ur10, stiffer):
+    """Against the matrix exponential of the state-space form under a zero-order hold, also where gears are so stiff that
+    what a motor feels between samples is the arm."""
     structure, par = build_structure(ur10), Parameters.nominal(ur10)
+    par = replace(par, stiffness=stiffer * par.stiffness, damping=np.sqrt(stiffer) * par.damping)
     lin = linearise(structure, equilibrium(structure, par, Q0))
     n, T = 6, 1e-3
     K, D = np.diag(par.stiffness), np.diag(par.damping)
@@ -71,6 +75,24 @@ def test_sampling_is_exact(ur10):
         w = 2 * np.pi * fk
         exact = np.linalg.solve(np.exp(1j * w * T) * np.eye(24) - E[:24, :24], E[:24, 24:])[:n] * -(w**2)
         assert np.abs(G - exact).max() < 2e-5 * np.abs(exact).max()
+
+
+def test_motion_is_told_from_images_as_the_response_has_them(identified):
+    """``true_position`` takes away what ``sampled_frf`` adds to the response in the band, on stiff gears too."""
+    problem = identified[1].problem
+    sampling, group = problem.sampling, problem.groups[0]
+    for stiffer in (1.0, 1e4):
+        par = replace(problem.nominal, stiffness=stiffer * problem.nominal.stiffness)
+        plane = make_plane(problem.structure, par, group, sampling)
+        assert (plane.images is None) == (stiffer == 1.0)
+        f = group.omega[1:] / 2 / np.pi
+        G = sampled_frf(problem.structure, par, plane.lin, f, sampling.sample_time, "zoh")[0]
+        band = hold_response(group.omega[1:], sampling.sample_time, "zoh")[:, None, None] * np.linalg.inv(plane.Z[1:])
+        images = np.einsum("lij,slj->sli", -G / group.omega[1:, None, None] ** 2 - band, group.U[:, 1:])
+        found = (group.Q - true_position(group, par, plane, sampling))[:, 1:]
+        assert np.abs(found - images).max() < 1e-6 * np.abs(images).max()
+        alone = true_position(group, par, plane, sampling, lambda s: np.ones((len(s), problem.structure.n)))
+        assert np.allclose(group.Q[:, 1:] - alone[:, 1:], found, rtol=1e-6, atol=1e-12 * np.abs(found).max())
 
 
 def test_a_stiff_hinge_changes_nothing_and_a_soft_one_adds_a_resonance(ur10):
