@@ -1008,6 +1008,9 @@ def test_an_offset_of_a_torque_record_is_no_spring(clean, tmp_path):
 def test_an_effect_at_its_bounds_is_none(named):
     backlash = named["backlash", "elbow_joint"]
     gap = backlash.parameters[0]
+    constant = named["torque_constant", "elbow_joint"]
+    scales = (0.99, 0.9995, 1.0005, 1.01)
+    assert [pointless(Effect(constant, np.array([x])), 1e4) for x in scales] == [False, True, True, False]
     assert pointless(Effect(backlash, np.array([gap.lower, 0.0])), 1e4)
     assert not pointless(Effect(backlash, np.array([1e-4, 0.0])), 1e4)
     spring = named["gravity_spring", "elbow_joint"]
