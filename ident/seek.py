@@ -94,7 +94,7 @@ def seek(
     found = Sought(setup, recorded, baseline, result, setup.problem.nominal, late=first_search.late)
     if foretell and unresolved(result) and not workers.late:
         return with_inertias(found, max_causes, workers)
-    return found
+    return replace(gone_on_with(found, max_causes, workers), late=workers.late)
 
 
 def gone_on_with(found: Sought, max_causes: int, workers: Workers) -> Sought:

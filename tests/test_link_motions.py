@@ -1,5 +1,6 @@
 """Laws of the gear in motions, which link encoders show and the torque hardly does."""
 
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -204,6 +205,28 @@ def test_a_search_by_link_encoders_goes_on_in_the_time_that_is_left(monkeypatch)
     assert gone_on_with(ended, 4, Workers()).result == ("both", "first", "causes")
     assert gone_on_with(replace(ended, late=False), 4, Workers()).result == "causes"
     assert gone_on_with(ended, 4, Workers(deadline=0.0)).result == "causes"
+
+
+def test_a_search_before_that_for_inertias_goes_on_where_none_are_asked(monkeypatch):
+    """It has half of the time too; where its causes leave next to nothing there is no other search after it."""
+    nominal = SimpleNamespace(groups=(), nominal=None, tau_std=np.ones(1), motions_alone=True)
+    setup = SimpleNamespace(problem=nominal)
+    monkeypatch.setattr("ident.seek.by_link_encoders", lambda *args: None)
+    monkeypatch.setattr("ident.seek.inertias_foretell", lambda setup: True)
+    monkeypatch.setattr("ident.seek.unresolved", lambda result: False)
+    monkeypatch.setattr("ident.seek.attribute", lambda problem, baseline, known, **rest: (baseline, known))
+
+    def sought(dataset, setup, baseline, max_causes, workers, first):
+        return setup, "first", "late causes" if first.late else "causes"
+
+    monkeypatch.setattr("ident.seek.sought", sought)
+    for seconds, expected in ((100.0, "causes"), (-1.0, "late causes")):
+        found = seek(None, setup, "first", 4, Workers(deadline=time.monotonic() + seconds))
+        assert found.result == expected and found.late == (seconds < 0.0)
+    half_gone = Workers(deadline=time.monotonic() + 100.0)
+    monkeypatch.setattr(Workers, "for_half", lambda self: replace(self, deadline=0.0))
+    found = seek(None, setup, "first", 4, half_gone)
+    assert found.result == ("first", "late causes") and not found.late
 
 
 def test_what_link_encoders_alone_show_carries_over_to_parts_left_out(ur10, tmp_path):
