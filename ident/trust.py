@@ -205,20 +205,22 @@ def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect
 
 
 def piece_of_a_curve(effect: Effect, final: Fit, predictions: Sequence[Prediction]) -> bool:
-    """Whether an effect is a spring to the link or a ripple beside one, of which the ripple does not come round along
-    all that its joint moves, and both leave more than noise there.
+    """Whether an effect is a ripple beside a spring to the link, which does not come round along all that its joint
+    moves; or the spring, where both leave more than noise there.
 
     A line and a part of a wave draw nearly any torque over the position, and where they miss it is none of theirs.
     """
     j = effect.hypothesis.joint
-    if effect.hypothesis.on_chain or final.costs[j] <= LEFT_ERROR * final.counts[j]:
+    if effect.hypothesis.on_chain:
         return False
     at_joint = [e for e in final.model.effects if e.hypothesis.joint == j and not e.hypothesis.on_chain]
     springs = [e for e in at_joint if e.hypothesis.effect in SPRINGS]
     ends = [(q.min(), q.max()) for q in (pred.motion().q(j) for pred in predictions)]
     path = max(top for _, top in ends) - min(bottom for bottom, _ in ends)
     parts = [e for e in at_joint if e.hypothesis.repeats and e.value(RIPPLE) * path < 2.0 * np.pi]
-    return bool(springs and parts) and any(e is effect for e in (*springs, *parts))
+    misses = final.costs[j] > LEFT_ERROR * final.counts[j]
+    doubted = [*parts, *(springs if misses else ())]
+    return bool(springs and parts) and any(e is effect for e in doubted)
 
 
 def unlike_a_load(effect: Effect, final: Fit, covariance: np.ndarray) -> bool:
