@@ -21,7 +21,7 @@ from ident.evidence import (
 from ident.hypotheses import Hypothesis
 from ident.parallel import Workers
 from ident.problem import Problem, predictions
-from ident.refits import FINALISTS, left_by, refit, reweighted, settled, under_own_noise
+from ident.refits import FINALISTS, left_by, refit, reweighted, settled, under_own_noise, with_drives_anew
 from ident.screening import Score, screen
 from ident.search import MIN_SHARE, STRONG, best_named, explore, explore_softly, under_noise_of_best
 from ident.strong import beside_strong
@@ -140,10 +140,21 @@ def attribute_once(
     ranked = sorted(best.values(), key=lambda x: x[1].cost)
     if ranked:
         before, ranked = under_noise_of_best(problem, before, ranked, workers)
+        ranked = begun_anew(problem, ranked, workers)
     left = leaves_much(problem, before, ranked) and not told and not workers.late
     if left and not (ranked and next_answers(problem, before, *ranked[0], hypotheses)):
         before, ranked = beside_strong(problem, before, ranked, scores, workers, quiet)
     return weighed_round(before, ranked, scores, softly)
+
+
+def begun_anew(
+    problem: Problem, ranked: Sequence[tuple[Hypothesis, Fit]], workers: Workers
+) -> list[tuple[Hypothesis, Fit]]:
+    """Candidates of which the first are ``with_drives_anew``, best first."""
+    new = workers.map_in_time(lambda x: with_drives_anew(problem, x[1]), ranked[:FINALISTS])
+    fits = [r if n is None or last_is_pointless(n) else n for n, (_, r) in zip(new, ranked[:FINALISTS], strict=True)]
+    first = [(h, r) for (h, _), r in zip(ranked[:FINALISTS], fits, strict=True)]
+    return sorted([*first, *ranked[FINALISTS:]], key=lambda x: x[1].cost)
 
 
 def leaves_much(problem: Problem, before: Fit, ranked: Sequence[tuple[Hypothesis, Fit]]) -> bool:

@@ -17,7 +17,7 @@ from ident.faint import LATE, SHADOW
 from ident.group import Group
 from ident.hypotheses import Hypothesis
 from ident.hypotheses.hypothesis import RIPPLE
-from ident.model import Effect
+from ident.model import Effect, is_linear
 from ident.problem import NOT_COMPUTED, Problem, data_counts, predictions
 from ident.pruning import UNTOLD, level
 from ident.quantization import Steps
@@ -270,6 +270,9 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
             # What the law of a spring lacks follows the position, stores what it takes, is on time, and grows with no
             # acceleration as an error of the position does.
             continue
+        if is_linear(o) and not is_linear(h) and down_to_noise(found):
+            # What a filter lacks is as linear as that: what bends explains no more than a part of it.
+            continue
         least = SHADOW
         alike = element(o) is not None and element(o) == element(h)
         cable = o.effect == "dress_pack" and element(h) == "friction"  # of which the law has a friction too
@@ -284,9 +287,14 @@ def shadowed(found: Round, rounds: Sequence[Round]) -> bool:
 
 def explained_by_time(found: Round) -> bool:
     """Whether a cause that drifts explains its joint down to the noise: what a law lacks at all times does not look so."""
+    return found.candidates[0].hypothesis.variable == "time" and down_to_noise(found)
+
+
+def down_to_noise(found: Round) -> bool:
+    """Whether a cause leaves noise alone at its joint."""
     winner = found.candidates[0]
     j = winner.hypothesis.joint
-    return winner.hypothesis.variable == "time" and winner.fit.costs[j] <= DETECTION_EXCESS * winner.fit.counts[j]
+    return bool(winner.fit.costs[j] <= DETECTION_EXCESS * winner.fit.counts[j])
 
 
 def overtone(found: Round, other: Round) -> bool:

@@ -373,6 +373,20 @@ def test_a_weak_drift_of_friction_beside_another_law_is_none_of_its_errors_where
 
 
 @pytest.mark.parametrize(
+    ("second", "left", "expected"),
+    [("torque_saturation", 1.05, False), ("torque_saturation", 1.5, True), ("torque_delay", 1.05, True)],
+)
+def test_what_bends_and_leaves_nothing_is_not_what_a_filter_lacks(named, second, left, expected):
+    def round_of(h, before, after):
+        fits = [SimpleNamespace(costs=np.full(6, x), counts=np.full(6, 1000.0)) for x in (before, after)]
+        return Round(fits[0], (Candidate(h, fits[1], 0.0),), (), 1.0, 1.0)
+
+    lag = round_of(named["sensor_lag", "elbow_joint"], 1e9, 1000.0 * left + 2000.0)
+    other = round_of(named[second, "elbow_joint"], 1000.0 * left + 2000.0, 1000.0 * left)
+    assert shadowed(other, (lag, other)) is expected
+
+
+@pytest.mark.parametrize(
     ("periods", "left", "expected"), [(3770.0, 95.0, True), (3770.0, 0.0, False), (3000.0, 95.0, False)]
 )
 def test_a_weak_ripple_at_a_multiple_of_the_periods_of_another_is_its_overtone(named, periods, left, expected):
