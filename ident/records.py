@@ -17,7 +17,7 @@ import scipy.ndimage
 
 from ident.closing import close_motion
 from ident.dataset import Dataset, Segment
-from ident.group import Group, signal_power
+from ident.group import FAST_LEVEL, NOISE_LINES, Group, mean_over_lines, signal_power
 from ident.rest import REST_TIME, at_rest, at_rest_in_period, difference_noise, lasting, slow, turning
 from ident.transients import ends_of_transients
 from robot_assets.errors import DataError
@@ -35,8 +35,10 @@ POINTS_PER_LINE = 6  # time grid of nonlinear laws, in points per highest line
 SIGNAL_BAND = 2.0  # band of the signals that laws see, in multiples of the compared band
 # the same of motions: the taper at their ends mixes lines that lie half of their compared band apart and more
 MOTION_BAND = 2.1
-# of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links
+# of motions whose link encoders are compared: jumps through lost motion are faster than the modes of the links; and of
+# fast motions, as far as they have more than a share of their acceleration, rms, beyond
 FAST_BAND = 6.0
+FAST_SHARE = 0.08
 
 
 def build_groups(
@@ -251,6 +253,22 @@ def _lines(x: np.ndarray, n_lines: int) -> np.ndarray:
     return scipy.fft.rfft(x, axis=1, norm="forward")[:, :n_lines]
 
 
+def lines_of_motion(lines: np.ndarray, white: np.ndarray, least: int, most: int) -> int:
+    """How many lines of a motion are solved: as many as leave beyond no more than ``FAST_SHARE`` of the acceleration
+    of all joints, ``least`` and ``most`` aside. What is faster reaches the slow lines by the geometry of the arm.
+
+    Args:
+        lines: (L, n) of the position, rad, all that there are.
+        white: (n,) variance of a line by noise, rad2; what is near it is no motion.
+    """
+    power = np.abs(lines) ** 2
+    moves = mean_over_lines(power, NOISE_LINES) > 2.0 * FAST_LEVEL * white
+    signal = np.sum(np.where(moves, power, 0.0), axis=1) * np.arange(len(lines)) ** 4.0
+    beyond = np.cumsum(signal[::-1])[::-1]
+    more = beyond > FAST_SHARE**2 * beyond[0]
+    return int(np.clip(np.count_nonzero(more), least, most))
+
+
 def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool, began: Mapping[str, float]) -> Group:
     fs = dataset.sample_rate
     n_return = int(np.ceil(max(RETURN_TIME, 0.05 * len(segment.t) / fs) * fs))
@@ -259,8 +277,10 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
     q = close_motion(segment.q, n_return, fs, curvature=True)
     tau = close_motion(segment.tau, n_return, fs, curvature=False)
     top = min(int(band_hz * N / fs), N // 2 - 1)
-    n_slow = min(int(MOTION_BAND * top) + 2, N // 2)
-    n_lines = min(int(FAST_BAND * top) + 2, N // 2) if fast else n_slow
+    white_noise = difference_noise(segment.q) ** 2 / N
+    least, most = (min(int(band * top) + 2, N // 2) for band in (MOTION_BAND, FAST_BAND))
+    n_slow = lines_of_motion(_lines(q[None], N // 2)[0], white_noise, least, most)
+    n_lines = most if fast else n_slow
     # A ripple is fast along a motion that is slow: on a grid of the compared band alone it would fold into it.
     fine = min(N, scipy.fft.next_fast_len(int(MOTION_RATE * N / fs), real=True))
     n_time = max(fine, scipy.fft.next_fast_len(POINTS_PER_LINE * n_lines, real=True))
@@ -277,7 +297,6 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
         link = _lines(close_motion(segment.q_link, n_return, fs, curvature=True)[None], n_lines)
     # Dry friction turns where the velocity does: of that the compared lines alone know to hundredths of a second.
     beyond = _lines(q[None], min(N // 2, (n_time + 1) // 2))[None, :, n_lines:]
-    white_noise = difference_noise(segment.q) ** 2 / N
     group = Group(
         operating_point=segment.operating_point or segment.name,
         segments=(segment.name,),

@@ -6,22 +6,69 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ident.chain import build_structure
 from ident.closing import close_motion
 from ident.dataset import Dataset, Segment
 from ident.diagnosis import diagnose
 from ident.extended import predict
 from ident.gain import mean_squares, stretch_squares
+from ident.graybox import Parameters
 from ident.hypotheses import catalogue
 from ident.identification import set_up
+from ident.inverse import inverse_dynamics
 from ident.law_noise import law_noise
 from ident.model import Effect, Model
 from ident.problem import data_count, residual
-from ident.records import build_groups
+from ident.records import FAST_SHARE, build_groups, lines_of_motion
 from ident.weights import make_weights
 from robot_assets.robot import load_robot
 from tests.conftest import of_motions
 
 RATE = 500.0
+
+
+@pytest.mark.parametrize(
+    ("fastest", "share", "expected"),
+    [(20, 1.0, 42), (70, 1.0, 71), (70, 0.5 * FAST_SHARE, 42), (500, 10.0, 120), (70, 0.0, 42)],
+)
+def test_as_many_lines_of_a_motion_are_solved_as_it_has(fastest, share, expected):
+    """Of accelerations, beside noise that has far more of them at lines that are faster; one joint rests."""
+    rng = np.random.default_rng(1)
+    white = np.full(2, 1e-12)
+    lines = np.sqrt(0.5 * white) * (rng.normal(size=(900, 2)) + 1j * rng.normal(size=(900, 2)))
+    lines[10, 0] += 1e-2
+    lines[fastest, 0] += share * 1e-2 * (10.0 / fastest) ** 2
+    assert lines_of_motion(lines, white, 42, 120) == expected
+
+
+@pytest.mark.parametrize("fast", [0.0, 0.02])
+def test_a_motion_with_fast_parts_is_predicted_as_a_slow_one(ur10, fast):
+    """Torque of a flexible arm along a motion of its links, in closed form by its lines: what is faster than twice the
+    compared band reaches into it by inertias that change and by Coriolis torque."""
+    par, structure, seconds = Parameters.nominal(ur10), build_structure(ur10), 24.0
+    t = np.arange(int(seconds * RATE)) / RATE
+    part = slice(0, 2 * len(t) // 3)
+    rng = np.random.default_rng(5)
+    links = np.array([0.2, -1.2, 0.9, 0.1, 0.5, 0.3]) + np.zeros((len(t), 1))
+    for f, size in ((1 / seconds, 0.3), (3 / seconds, 0.2), *((f, fast) for f in np.arange(5.5, 8.0, 0.25))):
+        rises = np.zeros(len(t))  # what is fast grows from nothing, and leaves nothing that swings
+        rises[part] = np.hanning(len(t[part])) ** 2
+        phase = rng.uniform(0.0, 2.0 * np.pi, ur10.n)
+        links += size * np.cos(2.0 * np.pi * f * t[:, None] + phase) * (rises[:, None] if f > 1.0 else 1.0)
+    s = 2j * np.pi * np.fft.rfftfreq(len(t), 1.0 / RATE)[:, None]
+    lines = np.fft.rfft(links, axis=0)
+    rates = (np.fft.irfft(s**k * lines, len(t), axis=0) for k in (1, 2))
+    asked = np.fft.rfft(inverse_dynamics(structure, links, *rates), axis=0)
+    motors = lines + asked / (par.stiffness + s * par.damping)
+    torque = asked + (s**2 * par.inertia + s * par.viscous) * motors
+    tau, q = (np.fft.irfft(x, len(t), axis=0) for x in (torque, motors))
+    motion = Segment(name="m", role="identification", kind="trajectory", t=t[part], tau=tau[part], q=q[part])
+    problem = set_up(of_motions(ur10, RATE, [motion], q_std=1e-7, tau_std=1e-3)).problem
+    (group,) = problem.groups
+    left = residual(group, predict(Model(structure, par), group, problem.sampling))
+    whole = group.observe(group.U)
+    share = np.sqrt(np.sum(np.abs(left[:, 1:]) ** 2, axis=1) / np.sum(np.abs(whole[:, 1:]) ** 2, axis=1))
+    assert share.max() < 3e-3
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-6])
