@@ -20,8 +20,9 @@ from ident.hypotheses import Hypothesis, catalogue
 from ident.identification import identify
 from ident.model import Effect, Model, along_record
 from ident.problem import Problem
-from ident.show.export import NATIVE, build_mjcf, note_record
+from ident.show.export import build_mjcf, note_record
 from ident.show.simulated_gain import export_baseline, simulated_errors, spread
+from ident.simulable import WITHOUT_ELEMENT
 from ident.torque_fit import Fit, fit
 from ident.units import units_of_torques
 from ident.values import baseline_values, reported_parameters
@@ -144,7 +145,7 @@ def main() -> None:
         closed = [g.gap_closed for g in (predicted, simulated)]
         shown = [f"{'no gap':>9s}" if c is None else f"{c:9.3f}" for c in closed]
         apart = "" if None in closed else f"{closed[1] - closed[0]:10.3f}"
-        note = "" if name in NATIVE else "  not in the file"
+        note = "" if name not in WITHOUT_ELEMENT else "  not in the file"
         print(
             f"{name:22s} {effect.place:20s} {predicted.before:9.4g} {predicted.noise_floor:9.4g}"
             f" {shown[0]} {shown[1]} {apart:>10s}  {time.perf_counter() - began:.0f}{note}",

@@ -44,6 +44,7 @@ from ident.recorded_noise import given_noise
 from ident.reporting import where
 from ident.rigid import RigidFit
 from ident.rounds import Round
+from ident.simulable import not_simulated_note
 from ident.tones import Tone
 from ident.torque_fit import Fit
 from ident.trust import (
@@ -321,6 +322,7 @@ def notes_on(found: Findings, causes: Sequence[Cause], tones: Sequence[Tone], de
         yield roll_off_note(problem)
     if problem.sampling.late_excitation:
         yield excitation_note(problem)
+    yield from not_simulated_note(causes)
     if found.gain is None and not found.setup.held_out:
         yield "No gain is measured: nothing is held out, and of a single operating point nothing can be left out."
 

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident.hypotheses.link_springs import spring_between_points
+from ident.hypotheses.ripple import ripple
 from ident.hypotheses.slips import parallel_slips
-from ident.hypotheses.yielding import along_path, bristle, elastoplastic
+from ident.hypotheses.yielding import along_path, bristle, dipping_bristle, elastoplastic
 from ident.show.dips import square_dips
 from ident.show.export import build_mjcf
 from robot_assets.robot import load_robot
@@ -60,6 +61,14 @@ def test_cogging_is_a_sine_of_the_motor_angle(bench):
     assert np.allclose(forced(model, data, q, 0 * q), 0.5 * np.sin(101.3 * q + 0.4), atol=1e-12)
 
 
+def test_cogging_has_the_second_harmonic_of_its_law(bench):
+    p = {"amplitude": 0.5, "periods_per_rev": 101.3, "phase": 0.4}
+    model, data = exported(bench, cause("cogging", JOINT, **p, second_sine=0.2, second_cosine=-0.1))
+    q = np.linspace(-3, 3, 50)
+    law, _ = ripple(0.5 * np.cos(0.4), 0.5 * np.sin(0.4), (0.2, -0.1), 101.3 * q)
+    assert np.allclose(forced(model, data, q, 0 * q), law, atol=1e-6)
+
+
 def test_coulomb_friction_is_asymmetric_and_turns_within_a_step(bench):
     model, data = exported(bench, cause("coulomb_friction", JOINT, torque=0.3, asymmetry=0.2))
     turn = 0.3 / parameters(bench)[f"motor_inertia.{JOINT}"] * model.opt.timestep
@@ -102,6 +111,16 @@ def test_stribeck_friction_falls_with_velocity(bench, exponent):
     law = np.sign(v) * (0.2 + 0.3 * np.exp(-(np.abs(v / 0.1) ** exponent)))
     slides = (np.abs(v) > 0.02) & (t > 1.0)  # beyond the breakaway distance of the bristle
     assert np.allclose(forced(model, data, q, v)[slides], -law[slides], rtol=2e-3 if exponent == 2.0 else 1.5e-2)
+
+
+def test_a_stribeck_friction_that_gives_does_so_as_its_bristle(bench):
+    p = {"coulomb": 0.2, "static": 0.5, "stribeck_velocity": 0.05, "exponent": 2.0, "stiffness": 60.0}
+    model, data = exported(bench, cause("stribeck_friction", JOINT, **p))
+    _, q, v = swing(model, 0.02, 2.0)
+    limits = 0.2 + 0.3 * np.exp(-((v / 0.05) ** 2))
+    law = dipping_bristle(v[None], model.opt.timestep, 60.0, limits[None])[0]
+    half = len(q) // 2
+    assert np.abs(forced(model, data, q, v) + law)[half:].max() < 0.02 * 0.5
 
 
 @given(st.floats(0.5, 2.0))
@@ -165,6 +184,50 @@ def test_sharp_presliding_friction_is_slips(bench):
     law = elastoplastic(q[None], 100.0, 0.3)[0]
     half = len(q) // 2
     assert np.abs(forced(model, data, q, v) + law)[half:].max() < 0.02 * 0.3
+
+
+def test_cables_that_give_before_they_slip_are_a_slip_on_the_link(bench):
+    """Beside their spring, and no dry friction in its place."""
+    p = {"stiffness": 4.0, "friction": 0.3, "yield_angle": 5e-3, "rest_angle": 0.1}
+    model, data = exported(bench, cause("dress_pack", JOINT, **p))
+    at, motor = model.joint(f"link:{JOINT}"), model.joint(f"motor:{JOINT}")
+    _, q, v = swing(model, 0.02, 2.0)
+    model.tendon_stiffness[0], model.tendon_damping[0] = 0.0, 0.0
+    out = []
+    for x, rate in zip(q, v, strict=True):
+        data.qpos[at.qposadr], data.qvel[at.dofadr], data.qvel[motor.dofadr] = x, rate, 0.0
+        mujoco.mj_forward(model, data)
+        out.append(data.qfrc_passive[at.dofadr[0]])
+        mujoco.mj_step(model, data)
+    law = 4.0 * (q - 0.1) + elastoplastic(q[None], 0.3 / 5e-3, 0.3)[0]
+    half = len(q) // 2
+    assert np.abs(np.array(out) + law)[half:].max() < 0.02 * 0.3
+    assert model.dof_frictionloss[at.dofadr[0]] == 0.0
+
+
+@pytest.mark.parametrize(
+    "slips",
+    [
+        cause("hysteresis", JOINT, stiffness=80.0, yield_torque=0.2),
+        cause("presliding_friction", JOINT, stiffness=100.0, coulomb=0.3, spread=0.4),
+        cause("dress_pack", JOINT, stiffness=4.0, friction=0.3, yield_angle=5e-3),
+    ],
+    ids=lambda c: c.effect,
+)
+def test_what_yields_is_stepped_finely_and_without_stages(bench, slips):
+    """A rotor that swings freely against the element takes the path of one in steps four times finer."""
+    spec = build_mjcf(bench, parameters(bench), [slips])
+    ends = []
+    for finer in (1.0, 4.0):
+        model = spec.compile()
+        model.opt.timestep /= finer
+        data = mujoco.MjData(model)
+        data.qvel[:] = 0.5
+        while data.time < 0.3:
+            mujoco.mj_step(model, data)
+        ends.append(data.qpos.copy())
+    assert spec.option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert np.allclose(*ends, atol=2e-5)
 
 
 @pytest.mark.parametrize("delay", [1e-4, 4e-4, 1.07e-3])

@@ -16,10 +16,11 @@ from ident.graybox import Parameters, equilibrium, linearise, parameter_names
 from ident.hypotheses.structure import Change, apply_change
 from ident.plan import make_plan
 from ident.plan_file import plan_from_toml
-from ident.show.export import build_mjcf
+from ident.show.export import build_mjcf, write_model_toml
 from ident.show.figures import rounded, trace_figure
 from ident.show.outputs import write_outputs
 from ident.show.report import unbroken, write_report
+from ident.simulable import not_simulated, not_simulated_note
 from ident.verdict import (
     Cause,
     Diagnosis,
@@ -246,6 +247,67 @@ def test_every_effect_is_exported_into_a_model_that_compiles_and_runs(ur10, made
     note = bytes(model.text_data).decode()
     assert note.startswith(f"{made.effect} at {made.joint}, probability 0.970")
     assert ("not simulated" in note) == (made.effect == "load_dependent_friction")
+
+
+@pytest.mark.parametrize(
+    ("made", "told"),
+    [
+        (cause("coulomb_friction", "elbow_joint", torque=2.0), "frictionloss of motor:elbow_joint"),
+        (
+            cause("coulomb_friction", "elbow_joint", torque=2.0, asymmetry=0.1),
+            "frictionloss of motor:elbow_joint, passive:0",
+        ),
+        (cause("presliding_friction", "elbow_joint", stiffness=1e3, coulomb=2.0, exponent=1.0), "passive:0"),
+        (
+            cause("presliding_friction", "elbow_joint", stiffness=1e3, coulomb=2.0, exponent=50.0),
+            "friction:0.0",
+        ),
+        (cause("torque_lag", "elbow_joint", time_constant=0.002), "filter of first order of drive:elbow_joint"),
+        (
+            cause("dress_pack", "elbow_joint", stiffness=50.0, friction=0.3, yield_angle=0.01),
+            "spring of link:elbow_joint, friction:0.0",
+        ),
+        (
+            replace(cause("joint_coupling", "wrist_3_joint", ratio=0.1), joints=("wrist_3_joint", "wrist_2_joint")),
+            "motor:wrist_3_joint in gear:wrist_2_joint",
+        ),
+        (
+            cause("backlash", "elbow_joint", gap=1e-3, loose=2e-3),
+            "springlength of gear:elbow_joint; not simulated: that the damper of elbow_joint is loose within its backlash too",
+        ),
+    ],
+    ids=lambda x: x.effect if isinstance(x, Cause) else "",
+)
+def test_the_file_says_which_elements_it_has(ur10, made, told):
+    text = build_mjcf(ur10, parameters(ur10), [made]).text("simgap.effect.0").data
+    assert text.rpartition("; element: ")[2] == told
+
+
+def test_what_mujoco_cannot_simulate_is_said():
+    friction = cause("load_dependent_friction", "elbow_joint", coefficient=0.05)
+    loose = cause("backlash", "wrist_1_joint", gap=1e-3, loose=2e-3)
+    slips = cause("presliding_friction", "elbow_joint", stiffness=1e3, coulomb=2.0, spread=0.4)
+    damped = replace(slips, parameters=slips.parameters | {"relaxation": Value(1e-6, 1e-5, "s")})
+    assert not_simulated_note([slips, damped, cause("coulomb_friction", "elbow_joint", torque=1.0)]) == ()
+    (note,) = not_simulated_note([friction, slips, loose])
+    assert "load dependent friction at elbow_joint; " in note and "loose within its backlash" in note
+    for knee, lost in ((0.01, False), (0.1, True)):
+        assert bool(not_simulated(cause("torque_saturation", "elbow_joint", limit=50.0, knee=knee))) == lost
+
+
+def test_the_parameter_file_says_what_is_of_which_channel_and_joints(diagnosis, tmp_path):
+    causes = (
+        replace(cause("sensor_delay", "elbow_joint", delay=1e-3), channel="q_link"),
+        replace(cause("joint_coupling", "wrist_3_joint", ratio=0.1), joints=("wrist_3_joint", "wrist_2_joint")),
+        cause("transmission_error", "elbow_joint", amplitude=1e-4, periods_per_rev=50.0, phase=0.1),
+    )
+    write_model_toml(replace(diagnosis, verdict=replace(diagnosis.verdict, causes=causes)), tmp_path / "model.toml")
+    toml = tomllib.loads((tmp_path / "model.toml").read_text(encoding="utf-8"))
+    late, coupled, error = toml["effect"]
+    assert late["channel"] == "q_link" and coupled["joints"] == ["wrist_3_joint", "wrist_2_joint"]
+    assert "channel" not in coupled and "joints" not in error
+    assert [x["simulated"] for x in toml["effect"]] == [True, True, False]
+    assert toml["not_simulated"] == ["transmission error at elbow_joint"]
 
 
 @pytest.fixture

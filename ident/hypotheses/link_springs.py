@@ -21,6 +21,7 @@ TURNS = 0.02  # of the rms velocity, within which the friction of a cable turns,
 RUBS = 0.1, 1.0  # friction of a cable, over the torque of its spring in the rms motion, to begin with
 REST = Parameter("rest_angle", "rad", -FARTHEST_REST, FARTHEST_REST, nuisance=True, step=1e-3, spread=0.3, null=0.0)
 YIELDS = 0.1  # of the rms motion, over which a cable gives before it slips, to begin with
+YIELD_ANGLE = Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02, reported=True)
 
 
 def gravity_spring(joint: int, place: str, linear: bool = False) -> Hypothesis:
@@ -115,8 +116,7 @@ def dress_pack(joint: int, place: str, leads: bool = True, yields: bool = False,
     """
     lead, _ = sought(LEAD, leads and not yields)
     rest, _ = sought(REST, hung)
-    turn_or_give = (Parameter("yield_angle", "rad", 1e-7, 1.0, log=True, nuisance=True, step=0.02), START)
-    own = (*(turn_or_give if yields else (SMOOTHING, *lead)), *rest)
+    own = (*((YIELD_ANGLE, START) if yields else (SMOOTHING, *lead)), *rest)
 
     def screen(motion: Motion, j: int, k: float, shape) -> Screen:
         v, q = ahead(motion.v_link(j), motion.time_step, sum(shape)), motion.q_link(j)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,21 +14,21 @@ import tomlkit
 
 from ident.chain import LinkChange, build_structure
 from ident.hypotheses.slips import parallel_slips
-from ident.hypotheses.yielding import DAHL, SLIP
+from ident.hypotheses.yielding import SLIP
 from ident.show.dips import SQUARE, square_dips
 from ident.show.slips import maxwell_slips
+from ident.simulable import is_sum_of_slips, not_simulated
 from ident.units import unit_suffix
 from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
 
 TIMESTEP = 2.5e-4  # s, with the Runge-Kutta integrator
-FINE_TIMESTEP = 5e-5  # s, with the implicit integrator: stiff bristles upset the stages of Runge-Kutta
+FINE_TIMESTEP = 5e-5  # s, with the implicit integrator: what yields upsets the stages of Runge-Kutta
 MOST_REFINED = 10  # at most this many times finer where a delay or a lag is shorter than a step
 BRISTLE = 0.7  # frequency of a bristle that stands for a sign, over the step rate, rad
 TIGHT = [0.999, 0.999, 0.001, 0.5, 2.0]  # impedance of dry friction: hardly any creep
 NO_INPUT = int(mujoco.mjtCtrlInput.mjINPUT_NONE)
-MOST_ROUNDED = 2.0  # exponent of a presliding friction below which it is the bristle that MuJoCo has
-FRICTION_SLIP = "friction"  # begins the names of springs that stand for the friction of a motor
+FRICTION_SLIP = "friction"  # begins the names of springs that stand for the friction of a motor or a link
 PASSIVE_GROUP = 1  # of actuators without input
 MOST_CONSTANT = 0.99  # share of a force of a spring that does not grow with its length
 TORQUE_OFFSET = "torque_offset"
@@ -37,11 +38,12 @@ ROTOR_BODY = 0.4 * ROTOR_MASS * 0.05**2
 
 
 def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
-    """Parameters of the extended model and its effects, with units."""
+    """Parameters of the extended model and its effects, with units, and what of these model.xml does not simulate."""
     head: dict = {
         "format": "simgap-model/1",
         "robot": diagnosis.robot.name,
         "dataset": diagnosis.verdict.dataset,
+        "not_simulated": [text for text in map(not_simulated, diagnosis.verdict.causes) if text],
         "parameters": {},
         "effect": [],
     }
@@ -60,6 +62,9 @@ def write_model_toml(diagnosis: Diagnosis, path: Path) -> None:
                 "name": cause.effect,
                 "place": cause.joint,
                 "probability": cause.probability,
+                "simulated": not not_simulated(cause),
+                **({"channel": cause.channel} if cause.channel else {}),
+                **({"joints": list(cause.joints)} if cause.joints else {}),
                 **({"with_load": True} if cause.with_load else {}),
                 "parameters": {
                     k: {"value": v.value, "std": v.std, "unit": v.unit} for k, v in cause.parameters.items()
@@ -89,9 +94,10 @@ def build_mjcf(
 
     Bodies are written from the Pinocchio chain. A motor is a rotor beside the chain; a fixed
     tendon of length ``q_motor - q_link`` is its gear. Effects are native elements where MuJoCo has
-    them. All are kept as ``<custom>`` numbers ``simgap.<i>.<effect>.<place>.<parameter>`` and a text
-    ``simgap.effect.<i>`` that says which element stands for the effect, if one does. Delays, lags and
-    friction are exact under the time step and the integrator of the file.
+    them (``ident.simulable`` says of which it has none). All are kept as ``<custom>`` numbers
+    ``simgap.<i>.<effect>.<place>.<parameter>`` and a text ``simgap.effect.<i>`` that says which elements stand for the
+    effect, if any. Delays, lags, friction and what yields hold under the time step and the integrator of the file;
+    others need not.
 
     Args:
         parameters: by the names of ``ident.graybox.parameter_names``, and ``link_friction.<joint>`` where links have
@@ -123,9 +129,9 @@ def build_mjcf(
         _add_motor(spec, joint.name, parameters)
         spec.joint(f"link:{joint.name}").damping = [parameters.get(f"link_friction.{joint.name}", 0.0), 0, 0]
     for i, cause in enumerate(causes):
-        _note_effect(spec, i, cause)
         if cause.joint in robot.joint_names:
             _add_effect(spec, i, cause)
+        _note_effect(spec, i, cause, _turned(robot, cause))
     for (source, target), ratio in _couplings(robot, causes).items():
         slips = [f"slip:{i}." for i, c in enumerate(causes) if c.effect == "hysteresis" and c.joint == target]
         for tendon in spec.tendons:
@@ -231,50 +237,73 @@ def _add_motor(spec: mujoco.MjSpec, name: str, parameters: dict[str, float]) -> 
     drive.set_to_motor()
 
 
-NATIVE = {
-    "coulomb_friction": "frictionloss of motor:{place} and, where it is asymmetric or a bristle, passive:{index}",
-    "stribeck_friction": "bristles passive:{index} ..., as stiff as the time step allows, for the turn of the sign",
-    "presliding_friction": "bristle of passive:{index}, or springs friction:{index} which yield",
-    "cogging": "cogging of passive:{index}",
+ELEMENTS = {
     "torque_constant": "gear of drive:{place}",
-    "torque_lag": "first-order filter and delay of drive:{place}",
     "torque_delay": "delay of drive:{place}",
     "torque_saturation": "forcerange of drive:{place}",
     "hardening_stiffness": "cubic stiffness of gear:{place}",
-    "softening_stiffness": "gear:{place} and, with a dead band, outer:{place}",
+    "softening_stiffness": "stiffness of gear:{place} and, beyond the transition, outer:{place}",
     "backlash": "springlength of gear:{place}",
-    "hysteresis": "springs slip:{index}, which yield",
-    "gravity_spring": "spring of link:{place}, or the tendon spring:{index} between two points",
-    "dress_pack": "spring and frictionloss of link:{place}",
-    "joint_coupling": "motor:{place} in the gear of the joint that it turns too",
-    "payload": "inertia of the last body",
+    "joint_coupling": "motor:{place} in gear:{turned}",
+    "payload": "inertia of the body that carries it",
     "link_inertia": "inertia of the body",
     "transverse_elasticity": "hinge elasticity:{effect}:{place}:{index}",
     "base_elasticity": "hinge elasticity:{effect}:{place}:{index}",
-    "sensor_delay": "delay of sensor encoder:{index}",
 }
+"""What of the arm stands for an effect that has no element of its own."""
 
 
-def _note_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
-    """The effect as custom elements, whether or not MuJoCo has an element for it."""
+def _element(spec: mujoco.MjSpec, index: int, cause: Cause, turned: str) -> str:
+    """Which elements of the file stand for an effect.
+
+    Args:
+        turned: joint that a coupled one turns too.
+    """
+    named = re.compile(rf"[a-z]+:{index}(\..+)?")
+    own = [x.name for x in (*spec.actuators, *spec.tendons, *spec.sensors) if named.fullmatch(x.name)]
+    p = {k: v.value for k, v in cause.parameters.items()}
+    shared = ELEMENTS.get(cause.effect, "").format(place=cause.joint, effect=cause.effect, index=index, turned=turned)
+    if cause.effect == "coulomb_friction" and "stiffness" not in p:
+        shared = f"frictionloss of motor:{cause.joint}"
+    elif cause.effect == "torque_lag":
+        lag, late = lag_and_delay(p)
+        parts = [name for name, x in (("filter of first order", lag), ("delay", late)) if x > 0.0]
+        shared = f"{' and '.join(parts)} of drive:{cause.joint}"
+    elif cause.effect in ("gravity_spring", "dress_pack") and "stretch" not in p:
+        rubs = " and frictionloss" if p.get("friction", 0.0) > 0.0 and "yield_angle" not in p else ""
+        shared = f"spring{rubs} of link:{cause.joint}"
+    lost = not_simulated(cause)
+    there = ", ".join([shared] * bool(shared) + own)
+    if not there:
+        return "none: not simulated by this file"
+    return f"{there}; not simulated: {lost}" if lost else there
+
+
+def _note_effect(spec: mujoco.MjSpec, index: int, cause: Cause, turned: str) -> None:
+    """The effect as custom elements, whether or not MuJoCo has an element for it; ``turned`` as of ``_element``."""
     for key, x in cause.parameters.items():
         number = spec.add_numeric(name=f"simgap.{index}.{cause.effect}.{cause.joint}.{key}")
         number.data, number.size = [float(x.value)], 1
     values = ", ".join(f"{k} = {x.value:.6g} +- {x.std:.2g}{unit_suffix(x.unit)}" for k, x in cause.parameters.items())
-    element = NATIVE.get(cause.effect, "none: not simulated by this file")
-    element = element.format(place=cause.joint, effect=cause.effect, index=index)
     text = spec.add_text(name=f"simgap.effect.{index}")
-    text.data = f"{cause.effect} at {cause.joint}, probability {cause.probability:.3f}; {values}; element: {element}"
+    text.data = f"{cause.effect} at {cause.joint}, probability {cause.probability:.3f}; {values}; element: " + _element(
+        spec, index, cause, turned
+    )
+
+
+def _turned(robot: Robot, cause: Cause) -> str:
+    """The joint that a coupled one turns too: the next one where the cause does not say which; empty of others."""
+    if cause.effect != "joint_coupling":
+        return ""
+    return cause.joints[-1] if cause.joints else robot.joint_names[robot.joint_names.index(cause.joint) + 1]
 
 
 def _couplings(robot: Robot, causes: Sequence[Cause]) -> dict[tuple[str, str], float]:
-    """(motor, joint that it turns too) -> ratio; a tendon takes a joint once. The next joint where a cause does not say
-    which."""
+    """(motor, joint that it turns too) -> ratio; a tendon takes a joint once."""
     out: dict[tuple[str, str], float] = {}
     for c in causes:
         if c.effect == "joint_coupling":
-            turned = c.joints[-1] if c.joints else robot.joint_names[robot.joint_names.index(c.joint) + 1]
-            pair = (c.joint, turned)
+            pair = (c.joint, _turned(robot, c))
             out[pair] = out.get(pair, 0.0) + c.parameters["ratio"].value
     return out
 
@@ -284,10 +313,12 @@ def _stepping(causes: Sequence[Cause], fastest: float) -> tuple[float, mujoco.mj
 
     ``fastest`` is the rate at which a damper stops a rotor, 1/s: beyond the step rate it is for the implicit
     integrator. The force of a bristle in the inner stages of Runge-Kutta runs away where it relaxes within a step
-    and its level changes with velocity; the implicit integrator has no such stages. A filter is stable
-    with Runge-Kutta, and a delay read from past samples alone, where they last longer than a step.
+    and its level changes with velocity, and where a spring yields is kept once a step, whatever its stages saw; the
+    implicit integrator has no such stages. What a spring goes beyond its yield within a step is an error of its
+    force, so that the steps are fine. A filter is stable with Runge-Kutta, and a delay read from past samples alone,
+    where they last longer than a step.
     """
-    if fastest * TIMESTEP > 1.0 or any(c.effect == "stribeck_friction" for c in causes):
+    if fastest * TIMESTEP > 1.0 or any(c.effect == "stribeck_friction" or _slips(c) for c in causes):
         return FINE_TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     parts = [1.0]
     for c in causes:
@@ -348,16 +379,27 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         if bias:
             _add_passive(spec, index, name, cogging=[-bias, 0.0, 0.5 * np.pi])
     elif cause.effect == "stribeck_friction":
-        stiffness, levels = motor.armature * (BRISTLE / step) ** 2, (p["coulomb"], max(p["static"], p["coulomb"]))
+        stiffest, levels = motor.armature * (BRISTLE / step) ** 2, (p["coulomb"], max(p["static"], p["coulomb"]))
+        stiffness = min(p.get("stiffness", np.inf), stiffest)
+        damping = stiffness * p.get("relaxation", 0.0)
         dips = square_dips(p["stribeck_velocity"], p.get("exponent", SQUARE))
         for part, (share, velocity) in enumerate(dips):
-            bristle = [share * stiffness, 0.0, *(share * level for level in levels), velocity]
+            bristle = [share * stiffness, share * damping, *(share * level for level in levels), velocity]
             _add_passive(spec, f"{index}.{part}" if part else index, name, lugre=bristle)
     elif cause.effect in ("presliding_friction", "coulomb_friction"):
-        limit = p["coulomb"] if cause.effect == "presliding_friction" else p["torque"]
-        _add_bristles(spec, index, name, limit, p)
+        if slips := _slips(cause):
+            _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"motor:{name}": 1.0})
+        else:
+            limit = p["coulomb"] if cause.effect == "presliding_friction" else p["torque"]
+            damping = p["stiffness"] * p.get("relaxation", 0.0)
+            _add_passive(spec, index, name, lugre=[p["stiffness"], damping, limit, limit, 1.0])
     elif cause.effect == "cogging":
         _add_passive(spec, index, name, cogging=[p["amplitude"], p["periods_per_rev"], p.get("phase", 0.0)])
+        sine, cosine = (p.get(f"second_{part}", 0.0) for part in ("sine", "cosine"))
+        if sine or cosine:
+            size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+            twice = [p["amplitude"] * size, 2.0 * p["periods_per_rev"], phase]
+            _add_passive(spec, f"{index}.second", name, cogging=twice)
     elif cause.effect == "torque_constant":
         drive.gear = [drive.gear[0] * p["scale"], 0, 0, 0, 0, 0]
     elif cause.effect == "torque_delay":
@@ -382,14 +424,15 @@ def _add_effect(spec: mujoco.MjSpec, index: int, cause: Cause) -> None:
         gear.stiffness = [low, 0, gear.stiffness[2]]
         _add_parallel(spec, f"outer:{name}", name, k - low, p["transition"])
     elif cause.effect == "hysteresis":
-        slips = maxwell_slips(p["stiffness"], p["yield_torque"], p.get("exponent", SLIP), p.get("recoil", 0.0))
-        _add_slips(spec, f"slip:{index}", slips, {f"motor:{name}": 1.0, f"link:{name}": -1.0})
+        _add_slips(spec, f"slip:{index}", _slips(cause), {f"motor:{name}": 1.0, f"link:{name}": -1.0})
     elif cause.effect in ("gravity_spring", "dress_pack"):
         if "stretch" in p:
             _add_spring_between_points(spec, f"spring:{index}", link, p)
         else:
             _add_spring(link, p["stiffness"], p.get("rest_angle", 0.0))
-        if p.get("friction", 0.0) > 0:
+        if slips := _slips(cause):
+            _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"link:{name}": 1.0})
+        elif p.get("friction", 0.0) > 0:
             _add_friction(link, p["friction"], step, p.get("lead", 0.0))
     elif cause.effect == "sensor_delay":
         side = "link" if cause.channel == "q_link" else "motor"
@@ -432,21 +475,6 @@ def _add_parallel(spec: mujoco.MjSpec, name: str, joint: str, stiffness: float, 
     return spring
 
 
-def _add_bristles(spec: mujoco.MjSpec, index: int, name: str, limit: float, p: Mapping[str, float]) -> None:
-    """Friction that yields before it slips at ``limit``, N m: the bristle that MuJoCo has, or slips in parallel."""
-    exponent = p.get("exponent", DAHL)
-    if "spread" in p:
-        each, limits = parallel_slips(p["stiffness"], limit, p["spread"])
-        slips = [(each, x) for x in limits]
-    elif exponent >= MOST_ROUNDED:
-        slips = maxwell_slips(p["stiffness"], limit, exponent, 1.0)
-    else:
-        damping = p["stiffness"] * p.get("relaxation", 0.0)
-        _add_passive(spec, index, name, lugre=[p["stiffness"], damping, limit, limit, 1.0])
-        return
-    _add_slips(spec, f"{FRICTION_SLIP}:{index}", slips, {f"motor:{name}": 1.0})
-
-
 def _add_spring_between_points(spec: mujoco.MjSpec, name: str, joint: mujoco.MjsJoint, p: Mapping[str, float]) -> None:
     """A tendon from a point of the link to one before its joint, as ``link_springs.spring_between_points`` describes.
 
@@ -480,6 +508,25 @@ def _nearer(stretch: float) -> float:
     """Smaller over larger distance ``r`` of two points from an axis, of a ``stretch`` of ``2 r / (1 - r)^2``."""
     half = 1.0 + 1.0 / stretch
     return float(half - np.sqrt(half**2 - 1.0))
+
+
+def _slips(cause: Cause) -> list[tuple[float, float]]:
+    """Stiffness (N m/rad) and yield torque (N m) of the springs that an effect is written as; none of one that is not.
+
+    A friction that yields is the bristle that MuJoCo has, unless it is sharper or a sum of slips.
+    """
+    p = {k: v.value for k, v in cause.parameters.items()}
+    if cause.effect == "hysteresis":
+        return maxwell_slips(p["stiffness"], p["yield_torque"], p.get("exponent", SLIP), p.get("recoil", 0.0))
+    if cause.effect == "dress_pack":
+        return [(p["friction"] / p["yield_angle"], p["friction"])] if "yield_angle" in p else []
+    if cause.effect not in ("presliding_friction", "coulomb_friction") or "stiffness" not in p:
+        return []
+    limit = p["coulomb"] if cause.effect == "presliding_friction" else p["torque"]
+    if "spread" in p:
+        each, limits = parallel_slips(p["stiffness"], limit, p["spread"])
+        return [(each, x) for x in limits]
+    return maxwell_slips(p["stiffness"], limit, p["exponent"], 1.0) if is_sum_of_slips(cause) else []
 
 
 def _add_slips(spec: mujoco.MjSpec, name: str, slips: Sequence[tuple[float, float]], along: dict[str, float]) -> None:
