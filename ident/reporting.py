@@ -124,15 +124,11 @@ def with_torque(dataset: Dataset, problem: Problem, predictions: Sequence[Predic
 
 
 def torque_traces(groups: Sequence[Group], pairs: Sequence[tuple[Prediction, Prediction]]) -> tuple[TorqueTrace, ...]:
-    """Measured and predicted torque in time, for the first segment of each group; of a motion without its ends, which
-    are not compared."""
+    """Measured and predicted torque in time as they are compared, for the first segment of each group; of a motion
+    without its ends, which are not compared. What is there is taken away before the lines are cut, or it would ring."""
     out = []
     for group, (a, b) in zip(groups, pairs, strict=True):
-        signals = []
-        for X in (group.U, a.U, b.U, group.Q):
-            Y = X[:1].copy()
-            Y[:, group.n_compared :] = 0.0
-            signals.append(group.to_time(Y)[0])
+        signals = [group.to_time(group.observe(X[:1]))[0] for X in (group.U, a.U, b.U, group.Q)]
         t = np.arange(group.n_time) * group.period_time / group.n_time
         show = t <= SHOWN_SECONDS
         if group.window is not None:

@@ -8,6 +8,7 @@ from ident.baseline import UNDETERMINED
 from ident.chain import INERTIAL, Structure
 from ident.evidence import ABSENT
 from ident.hypotheses import Hypothesis
+from ident.hypotheses.ripple import SECOND
 from ident.model import Effect
 from ident.rigid import RigidFit
 from ident.torque_fit import Fit
@@ -15,6 +16,7 @@ from ident.units import linear_names, parameter_unit, unit_at
 from ident.verdict import Value
 
 AXIS_STEP = 1e-6  # of a tilt
+HARMONIC = frozenset(q.name for q in SECOND)
 
 
 def named_effects(final: Fit) -> tuple[Effect, ...]:
@@ -64,13 +66,17 @@ def reported_parameters(effect: Effect, final: Fit, covariance: np.ndarray) -> d
     index = {name: i for i, name in enumerate(final.names)}
     linear = at_linear_joint(effect, final.model.structure)
     out: dict[str, Value] = {}
-    std = {}
+    std, found = {}, set()
     for q, v in zip(h.parameters, effect.p, strict=True):
         i = index[h.coordinate(q.name)]
         s = float(np.sqrt(max(covariance[i, i], 0.0)))
         std[q.name] = s * abs(v) if q.log else s
-        found = q.null is not None and not q.at_start and abs(v - q.null) > ABSENT * std[q.name]
-        if q.reported or not q.nuisance or found:
+        if q.null is not None and not q.at_start and abs(v - q.null) > ABSENT * std[q.name]:
+            found.add(q.name)
+    if found & HARMONIC:  # neither part of it says anything without the other
+        found |= HARMONIC
+    for q, v in zip(h.parameters, effect.p, strict=True):
+        if q.reported or not q.nuisance or q.name in found:
             out[q.name] = Value(float(v), std[q.name], unit_at(q.unit, linear))
     if "sine" in out:
         a, b = out.pop("sine"), out.pop("cosine")

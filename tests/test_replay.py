@@ -1,5 +1,8 @@
 """The exported model, simulated in closed loop along held-out motion, gains what the prediction says."""
 
+import json
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,11 +13,13 @@ from ident.diagnosis import diagnose_fully
 from ident.excitation import operating_points
 from ident.extended import predict
 from ident.identification import set_up
+from ident.leftover import SHOWN_WEIGHT
 from ident.model import Model
 from ident.records import build_groups
+from ident.reporting import torque_traces
 from ident.show.export import write_mjcf
 from ident.show.replay import equilibrium, load_arm, replay, sampled_impedance
-from ident.show.simulated_gain import export_baseline, spread
+from ident.show.simulated_gain import export_baseline, gain_beside, spread
 from robot_assets.errors import DataError
 from robot_assets.robot import load_robot
 from sim.effects import make_effect
@@ -157,12 +162,15 @@ def test_the_file_of_a_diagnosis_gains_what_its_verdict_says(tmp_path):
     diagnosis = diagnose_fully(data)
     assert [c.effect for c in diagnosis.verdict.causes] == ["gravity_spring"]
     write_mjcf(diagnosis, tmp_path / "model.xml")
+    diagnosis.verdict.save(tmp_path)
     gain = simulated_gain(load_dataset(tmp_path / "dataset"), tmp_path / "model.xml")
+    assert gain.noise_floor == pytest.approx(diagnosis.verdict.gain.noise_floor, rel=1e-12)
     assert gain.gap_closed == pytest.approx(diagnosis.verdict.gain.gap_closed, abs=CLOSE)
     assert "simulated" in gain.metric and gain.joints == diagnosis.verdict.gain.joints
 
 
-def test_without_held_out_segments_there_is_nothing_to_simulate(tmp_path):
+def test_without_held_out_segments_there_is_nothing_to_simulate(tmp_path, monkeypatch):
+    monkeypatch.setattr("ident.show.simulated_gain.identify", lambda *a, **k: pytest.fail("identified for nothing"))
     with pytest.raises(DataError, match="validation"):
         simulated_gain(drive_data(validation=0), tmp_path / "model.xml")
 
@@ -172,3 +180,27 @@ def test_a_few_segments_of_a_group_keep_their_order(clean_drive):
     chosen = group.pick(spread(len(group.segments), 1))
     assert chosen.segments == group.segments[:1] and chosen.U.shape[0] == chosen.excited.shape[0] == 1
     assert list(spread(6, 3)) == [0, 2, 5] and list(spread(2, 4)) == [0, 1]
+
+
+def test_joints_and_noise_are_those_of_the_verdict_beside_the_file(tmp_path):
+    """Of the segments that it speaks of, and on no others."""
+    gain = {"segments": ["a", "b"], "joints": ["x"], "by_joint": {"x": {"noise_floor": 0.5}, "y": {"noise_floor": 2.0}}}
+    (tmp_path / "verdict.json").write_text(json.dumps({"gain": gain}))
+    file = tmp_path / "model.xml"
+    assert gain_beside(file, ("x", "y"), ["b"]) == gain
+    assert gain_beside(file, ("x", "y"), ["c"]) is None and gain_beside(file, ("x", "z"), ["a"]) is None
+    (tmp_path / "verdict.json").write_text(json.dumps({"gain": None}))
+    assert gain_beside(file, ("x", "y"), ["a"]) is None
+    assert gain_beside(tmp_path / "elsewhere" / "model.xml", ("x", "y"), ["a"]) is None
+
+
+def test_what_a_window_leaves_out_is_not_drawn(clean_drive):
+    """A torque of the return of a motion, which nobody recorded, neither shows nor rings where the motion is shown."""
+    group = next(g for g in build_groups(clean_drive, role=None) if g.window is not None)
+    wrong = np.zeros((1, group.n_time, 1))
+    wrong[:, group.window == 0.0] = 1.0
+    before, after = (SimpleNamespace(U=U) for U in (group.U + group.to_lines(wrong), group.U))
+    (trace,) = torque_traces([group], [(before, after)])
+    assert len(trace.t) > 0.5 * np.sum(group.window > 0.0)
+    assert np.abs(trace.before - trace.after).max() < 2e-3
+    assert np.std(trace.q) == pytest.approx(np.std(group.to_time(group.Q)[0, group.window >= SHOWN_WEIGHT]), rel=0.05)

@@ -1,6 +1,7 @@
 """Ripples with a second harmonic: their law, and one hidden in the plant."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,11 +10,15 @@ from hypothesis import strategies as st
 
 from ident.diagnosis import diagnose
 from ident.hypotheses import catalogue
+from ident.hypotheses.drive import cogging
 from ident.hypotheses.ripple import ripple
 from ident.identification import identify
+from ident.model import Effect
 from ident.position_lines import wave_numbers
 from ident.problem import predictions
 from ident.screening import Score, other_waves, screen
+from ident.values import reported_parameters
+from robot_assets.robot import load_robot
 from sim import parse_effect
 from sim.effects.effect import Torque
 from sim.effects.transmission import carried
@@ -138,3 +143,16 @@ def test_a_wave_longer_than_a_posture_shows_is_found_over_all_of_them(locked, nu
     cogging = next(h for h in catalogue(problem.structure) if h.key == ("cogging", "elbow_joint"))
     (score,) = screen(problem, first, preds, [cogging])
     assert score.shape[0] == pytest.approx(number, rel=0.01)
+
+
+def test_a_second_harmonic_is_told_as_a_whole():
+    """Where one part of it is found; nothing of it where none is."""
+    h = cogging(0, "drive")
+    names = [h.coordinate(q.name) for q in h.parameters]
+    structure = SimpleNamespace(robot=load_robot("twomass"))
+    final = SimpleNamespace(names=names, model=SimpleNamespace(structure=structure))
+    covariance = np.diag([1e-2, 1e-2, 1e-2, 1e-2, 1e-2]) ** 2
+    for second, told in (((0.2, -0.02), True), ((0.02, -0.02), False)):
+        values = reported_parameters(Effect(h, np.array([0.5, 40.0, 0.1, *second])), final, covariance)
+        assert ("second_sine" in values, "second_cosine" in values) == (told, told)
+        assert values["amplitude"].value == pytest.approx(np.hypot(0.5, 0.1))

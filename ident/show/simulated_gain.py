@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -45,11 +48,13 @@ def simulated_gain(
     """Gain of an exported model over the identified one without effects, by simulation of both.
 
     The metric is that of the verdict's gain (``ident.gain``), with the torque of the simulated arms in the place of
-    predictions (``ident.show.replay``); the noise floor is that of the model without effects.
+    predictions (``ident.show.replay``). Joints and noise floor are those of the ``verdict.json`` beside the file. Without
+    one, or where that measures its gain on other segments, they are those of the model without effects: what is missing
+    of it may be in its noise.
 
     Args:
         dataset: with held-out segments, or a single motion whose end is held out.
-        model: ``model.xml`` of a diagnosis of it.
+        model: ``model.xml`` of a diagnosis of it, or a spec, which has no verdict beside it.
         segments: of each operating point that are simulated, at most.
         progress: told in a line what is done.
 
@@ -60,20 +65,46 @@ def simulated_gain(
         DataError: where the dataset breaks the format or has no held-out segments.
     """
     dataset = with_held_out(with_lost_samples_filled(checked(dataset))[0])
+    none = DataError("segments", dataset.name, "none of role validation", "at least one to simulate")
+    if not any(s.role == "validation" for s in dataset.segments):
+        raise none
     setup, baseline = identify(dataset, progress=progress)
     if not setup.held_out:
-        raise DataError("segments", dataset.name, "none of role validation", "at least one to simulate")
+        raise none
     problem = setup.problem
     groups = tuple(g.pick(spread(len(g.segments), segments)) for g in setup.held_out)
-    affected = affected_joints(problem, baseline, predictions(problem, baseline.model, baseline.remainders))
+    joints = problem.structure.robot.joint_names
+    told = gain_beside(model, joints, [name for g in groups for name in g.segments])
+    if told is None:
+        affected = affected_joints(problem, baseline, predictions(problem, baseline.model, baseline.remainders))
+    else:
+        affected = tuple(j for j, name in enumerate(joints) if name in told["joints"])
     if progress is not None:
         progress("simulation of both models")
     before = export_baseline(baseline.model, problem.sampling)
     errors = simulated_errors(problem, groups, baseline.model, before, model)
+    if told is not None:
+        floor = np.array([told["by_joint"][name]["noise_floor"] for name in joints])
+        errors = replace(errors, noise=np.broadcast_to(floor**2, errors.noise.shape))
     rng = np.random.default_rng(SEED)
     return measure_gain(
         errors, units_of_torques(problem.structure.robot), affected, "simulated in closed loop", rng, METRIC
     )
+
+
+def gain_beside(
+    model: str | Path | mujoco.MjSpec, joints: Sequence[str], segments: Sequence[str]
+) -> dict[str, Any] | None:
+    """The gain of the ``verdict.json`` in the folder of a file, as it is written; None where there is none on these
+    joints and segments."""
+    if isinstance(model, mujoco.MjSpec):
+        return None
+    try:
+        gain = json.loads(Path(model).with_name("verdict.json").read_text(encoding="utf-8"))["gain"]
+        fits = set(gain["by_joint"]) == set(joints) and set(segments) <= set(gain["segments"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return gain if fits else None
 
 
 def export_baseline(model: Model, sampling: Sampling) -> mujoco.MjSpec:
