@@ -534,7 +534,7 @@ def _print(data: dict[str, Any], json_: bool, text: str) -> None:
 
 
 def _verdict_text(diagnosis: Diagnosis, out: Path) -> str:
-    from ident.units import torque_unit, unit_suffix
+    from ident.units import has_one_torque_unit, torque_unit, unit_suffix
 
     verdict = diagnosis.verdict
     lines = [verdict.sentence]
@@ -545,7 +545,8 @@ def _verdict_text(diagnosis: Diagnosis, out: Path) -> str:
     if verdict.gain is not None:
         g = verdict.gain
         of = f" at {', '.join(g.joints)}" if g.of_some else ""
-        over_all = f"; of all joints {g.over_all[0]:.4g} -> {g.over_all[1]:.4g}" if g.of_some else ""
+        told = g.of_some and has_one_torque_unit(diagnosis.robot)
+        over_all = f"; of all joints {g.over_all[0]:.4g} -> {g.over_all[1]:.4g}" if told else ""
         unit = torque_unit(diagnosis.robot, g.joints)
         lines.append(
             f"Torque error on held-out data{of}: {g.before:.4g} -> {g.after:.4g} {unit}, noise {g.noise_floor:.4g}{over_all}"

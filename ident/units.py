@@ -84,6 +84,11 @@ def common_unit(units: Iterable[str]) -> str:
     return " or ".join(sorted(set(units), reverse=True))
 
 
+def has_one_torque_unit(robot: Robot) -> bool:
+    """Whether torques of all joints have one unit: else no number stands for all of them."""
+    return len(set(torque_units(robot))) == 1
+
+
 def units_of_torques(robot: Robot) -> dict[str, str]:
     """Unit of its torque by joint."""
     return dict(zip(robot.joint_names, torque_units(robot), strict=True))

@@ -12,26 +12,30 @@ import numpy as np
 import pytest
 
 from ident.chain import build_structure
+from ident.cli import _verdict_text
 from ident.graybox import Parameters, equilibrium, linearise, parameter_names
 from ident.hypotheses.structure import Change, apply_change
 from ident.plan import make_plan
 from ident.plan_file import plan_from_toml
 from ident.show.export import build_mjcf, write_model_toml
-from ident.show.figures import rounded, trace_figure
+from ident.show.figures import rounded, shown_joints, trace_figure
 from ident.show.outputs import write_outputs
 from ident.show.report import unbroken, write_report
 from ident.simulable import not_simulated, not_simulated_note
 from ident.verdict import (
+    LEFT_OUT,
     Cause,
     Diagnosis,
     Discrepancy,
     EvidencePlot,
     FrfView,
     Gain,
+    JointGain,
     SpectrumMap,
     TorqueTrace,
     Value,
     Verdict,
+    Where,
 )
 from robot_assets.robot import Elasticity, load_robot
 from sim.plant import build_plant
@@ -380,25 +384,60 @@ def test_the_next_plan_is_written_and_an_old_one_taken_away(diagnosis, ur10, tmp
     assert not (tmp_path / "out" / "next_plan.toml").exists()
 
 
-@pytest.mark.slow
-def test_torques_are_shown_at_the_joints_of_the_gain_first():
-    """The other places go to the joints where the baseline errs most, relative to their torque."""
+def test_torques_are_shown_at_the_joints_of_causes_first(diagnosis):
+    """Then where the discrepancy is, then of the gain, then where the baseline errs most relative to the torque."""
     joints = tuple("abcdef")
     measured = np.tile(np.sin(np.arange(50.0))[:, None], 6)
     errors = np.array([0.01, 0.5, 0.02, 0.4, 0.3, 0.03]) * measured
+    errors[:, 5] = 0.6  # a static one
     trace = TorqueTrace("s", np.arange(50.0), measured, measured - errors, measured, measured)
-    shown = [
-        [j for j in joints if f"<!-- {j} -->" in trace_figure(trace, joints, ("N m",) * 6, of)]
-        for of in ((), ("c",), tuple("acf"))
-    ]
-    assert shown == [list("bde"), list("bcd"), list("acf")]
+    gain = replace(diagnosis.verdict.gain, joints=("c",))
+    verdict = replace(diagnosis.verdict, causes=(), gain=None)
+    coupled = replace(cause("joint_coupling", "c", ratio=0.1), joints=("c", "a"))
+    where = replace(verdict.discrepancy, where=(Where("d", "tau", "motion", 0.2), Where("e", "tau", "motion", 0.7)))
+    for told, shown in (
+        (verdict, "fbd"),
+        (replace(verdict, gain=gain), "cfb"),
+        (replace(verdict, gain=gain, discrepancy=where), "edc"),
+        (replace(verdict, discrepancy=where, causes=(coupled, cause("payload", "flange", mass=1.0))), "cae"),
+    ):
+        assert shown_joints(told, trace, joints) == list(shown)
+    figure = trace_figure(trace, joints, ("N m",) * 6, ["e", "a"])
+    assert [j for j in joints if f"<!-- {j} -->" in figure] == ["a", "e"]
+
+
+def test_forces_and_torques_are_told_in_their_own_units(diagnosis, monkeypatch, tmp_path):
+    """And no number stands for joints of both kinds."""
+    names = diagnosis.joints
+    gain = replace(
+        diagnosis.verdict.gain, joints=names[:1], by_joint={name: JointGain(1.0, 0.1, 0.09) for name in names}
+    )
+    shown = replace(diagnosis, verdict=replace(diagnosis.verdict, gain=gain), frf=(), spectrum=None)
+    for linear, told in (((False,) * 6, True), ((True, *(False,) * 5), False)):
+        monkeypatch.setattr("ident.units.linear_joints", lambda robot, linear=linear: linear)
+        write_report(shown, tmp_path / "report.html")
+        html = (tmp_path / "report.html").read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
+        html = html.replace("&nbsp;", " ")
+        first, second = ("N m", "N m") if told else ("N", "N m")
+        assert f"{names[0]} 1 → 0.1 {first} (noise" in html and f"{names[1]} 1 → 0.1 {second} (noise" in html
+        assert ("of all joints" in html) == ("of all joints" in _verdict_text(shown, tmp_path)) == told
+
+
+def test_the_report_says_which_segments_were_fitted(diagnosis, tmp_path):
+    for method, told in (
+        ("validation segments", "op03, held out"),
+        (LEFT_OUT, "op03, to which the models were fitted"),
+    ):
+        gain = replace(diagnosis.verdict.gain, method=method)
+        write_report(replace(diagnosis, verdict=replace(diagnosis.verdict, gain=gain)), tmp_path / "report.html")
+        assert told in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_same_data_are_the_same_picture():
     t = np.arange(50.0)
     measured = np.sin(t)[:, None]
     trace = TorqueTrace("s", t, measured, 0.9 * measured, measured, measured)
-    first, again = (trace_figure(trace, ("a",), ("N m",)) for _ in range(2))
+    first, again = (trace_figure(trace, ("a",), ("N m",), ("a",)) for _ in range(2))
     assert "url(#" in first and first == again
 
 

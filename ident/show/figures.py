@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
-from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace
+from ident.verdict import EvidencePlot, FrfView, SpectrumMap, TorqueTrace, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
@@ -49,6 +49,7 @@ STYLE: dict[RcKeyType, Any] = {
     "svg.fonttype": "path",
     "svg.hashsalt": "simgap",  # the same data are the same picture
 }
+SHOWN_JOINTS = 3
 POINTS = 1500
 CURVE = 300
 FREQUENCIES = 1.0, 2.0, 5.0  # that are told of each decade
@@ -248,15 +249,25 @@ def evidence_figure(plot: EvidencePlot) -> str:
         return _svg(fig)
 
 
-def trace_figure(
-    trace: TorqueTrace, joints: tuple[str, ...], units: tuple[str, ...], of_gain: Collection[str] = ()
-) -> str:
-    """Torque errors of both models in time on one held-out segment, of three joints: those ``of_gain`` first, then the
-    worst."""
-    before = (trace.measured - trace.before).std(axis=0)
-    scale = np.maximum(trace.measured.std(axis=0), 1e-9)
-    others = np.array([name not in of_gain for name in joints])
-    worst = np.sort(np.lexsort((-before / scale, others))[: min(3, len(joints))])
+def shown_joints(
+    verdict: Verdict, trace: TorqueTrace | None, joints: Sequence[str], most: int = SHOWN_JOINTS
+) -> list[str]:
+    """At most so many joints to look at: those of causes, then those at which the discrepancy is, then those of the gain,
+    then those with the largest error of the baseline over what the torque changes by. A static error counts."""
+    first = [name for c in verdict.causes for name in (c.joint, *c.joints)]
+    first += [w.joint for w in sorted(verdict.discrepancy.where, key=lambda w: -w.share)]
+    first += verdict.gain.joints if verdict.gain else ()
+    rest = list(joints)
+    if trace is not None:
+        error = np.sqrt(np.mean((trace.measured - trace.before) ** 2, axis=0))
+        order = np.argsort(-error / np.maximum(trace.measured.std(axis=0), 1e-9), kind="stable")
+        rest = [joints[j] for j in order]
+    return [name for name in dict.fromkeys((*first, *rest)) if name in joints][:most]
+
+
+def trace_figure(trace: TorqueTrace, joints: tuple[str, ...], units: tuple[str, ...], shown: Collection[str]) -> str:
+    """Torque errors of both models in time on one segment, of the joints ``shown``, in the order of the arm."""
+    worst = [j for j, name in enumerate(joints) if name in shown]
     with mpl.rc_context(STYLE):
         fig, axes = _subplots(
             len(worst), 1, figsize=(11, 1.4 * len(worst) + 0.5), sharex=True, squeeze=False, layout="constrained"

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ident.chain import build_structure, tell_links_apart
-from ident.show.figures import frf_picture, rounded
+from ident.show.figures import frf_picture, rounded, shown_joints
 from ident.units import response_unit, torque_unit, unit_suffix, units_of_torques
 from ident.verdict import Diagnosis, TorqueTrace
 from robot_assets.errors import DataError
@@ -47,14 +47,14 @@ def write_recording(diagnosis: Diagnosis, path: Path) -> None:
         _log_torques(stream, trace, diagnosis.joints)
         _log_arm(stream, diagnosis, trace)
     for view in diagnosis.frf[:1]:
-        picture = frf_picture(view, diagnosis.joints, _worst_joints(diagnosis)[:2], response_unit(diagnosis.robot))
+        picture = frf_picture(view, diagnosis.joints, _shown_joints(diagnosis)[:2], response_unit(diagnosis.robot))
         stream.log("frf", rr.EncodedImage(contents=picture, media_type="image/png"), static=True)
     stream.flush()
     stream.disconnect()
 
 
 def _blueprint(diagnosis: Diagnosis) -> rrb.Blueprint:
-    joints = _worst_joints(diagnosis)
+    joints = _shown_joints(diagnosis)
     unit = units_of_torques(diagnosis.robot)
     torques = [
         rrb.TimeSeriesView(origin=f"torque/{part(joints[0])}", name=f"{joints[0]}: motor torque, {unit[joints[0]]}")
@@ -94,13 +94,8 @@ def _eye(diagnosis: Diagnosis) -> rrb.EyeControls3D | None:
     return rrb.EyeControls3D(position=centre + distance * direction, look_target=centre, eye_up=[0.0, 0.0, 1.0])
 
 
-def _worst_joints(diagnosis: Diagnosis) -> list[str]:
-    """Three joints with the largest relative torque error of the baseline, worst first."""
-    if not diagnosis.traces:
-        return list(diagnosis.joints[:3])
-    t = diagnosis.traces[0]
-    error = (t.measured - t.before).std(axis=0) / np.maximum(t.measured.std(axis=0), 1e-9)
-    return [diagnosis.joints[j] for j in np.argsort(-error)[:3]]
+def _shown_joints(diagnosis: Diagnosis) -> list[str]:
+    return shown_joints(diagnosis.verdict, next(iter(diagnosis.traces), None), diagnosis.joints)
 
 
 def _markdown(diagnosis: Diagnosis) -> str:

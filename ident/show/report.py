@@ -13,11 +13,20 @@ from ident.show.figures import (
     frf_figure,
     frf_grid_figure,
     rounded,
+    shown_joints,
     trace_figure,
     where_figure,
 )
-from ident.units import parameter_unit, response_unit, torque_unit, torque_units, unit_suffix
-from ident.verdict import Diagnosis, FrfView, Value
+from ident.units import (
+    has_one_torque_unit,
+    parameter_unit,
+    response_unit,
+    torque_unit,
+    torque_units,
+    unit_suffix,
+    units_of_torques,
+)
+from ident.verdict import LEFT_OUT, Diagnosis, FrfView, Value
 
 MAX_FRFS = 3
 MAX_TRACES = 2
@@ -40,6 +49,9 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         rounded=rounded,
         unit_suffix=lambda unit: unbroken(unit_suffix(unit)),
         torque_unit=unbroken(torque_unit(robot, of_gain)),
+        unit_of={name: unbroken(unit) for name, unit in units_of_torques(robot).items()},
+        one_unit=has_one_torque_unit(robot),
+        held_out=gain.segments if gain and gain.method != LEFT_OUT else (),
         response_unit=response_unit(robot),
         table=parameter_table(diagnosis.verdict.baseline),
         grid=[
@@ -51,7 +63,8 @@ def write_report(diagnosis: Diagnosis, path: Path) -> None:
         where=where_figure(diagnosis.spectrum, joints, torque_unit(robot)) if diagnosis.spectrum else None,
         evidence={p.cause: evidence_figure(p) for p in diagnosis.evidence},
         traces=[
-            (t.segment, trace_figure(t, joints, torque_units(robot), of_gain)) for t in diagnosis.traces[:MAX_TRACES]
+            (t.segment, trace_figure(t, joints, torque_units(robot), shown_joints(diagnosis.verdict, t, joints)))
+            for t in diagnosis.traces[:MAX_TRACES]
         ],
     )
     path.write_text(html, encoding="utf-8")
