@@ -23,7 +23,7 @@ from ident.convert import convert_logs
 from ident.dataset import Dataset
 from ident.dataset_io import load_dataset, save_dataset
 from ident.diagnosis import MAX_SECONDS, diagnose_fully
-from ident.show.figures import trace_figure
+from ident.show.figures import shown_joints, trace_figure
 from ident.units import torque_unit, torque_units, unit_suffix
 from ident.verdict import Diagnosis, Gain
 
@@ -240,7 +240,8 @@ def section(found: Outcome) -> str:
     for trace in result.traces[: int(machine.picture)]:
         picture = PAGE.parent / f"{machine.folder}.svg"
         # The figures of the report take their colours from its page.
-        svg = trace_figure(trace, result.joints, torque_units(result.robot), result.verdict.gain.joints).replace(
+        shown = shown_joints(result.verdict, trace, result.joints)
+        svg = trace_figure(trace, result.joints, torque_units(result.robot), shown).replace(
             'version="1.1">', f'version="1.1">{COLOURS}', 1
         )
         picture.write_text(svg, encoding="utf-8")

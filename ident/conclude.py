@@ -33,6 +33,7 @@ from ident.notes import (
     nameless_note,
     noise_note,
     record_note,
+    refitted_note,
     roll_off_note,
     sentence,
     step_note,
@@ -301,6 +302,7 @@ def notes_on(found: Findings, causes: Sequence[Cause], tones: Sequence[Tone], de
         yield from held_out_note(found.gain)
     if not named:
         yield from drift_note(problem)
+        yield from refitted_note(found.baseline, final, found.gain)
     yield from (tone_note(x, joints[x.joint]) for x in tones)
     yield from (lost_note(x, joints[x.joint]) for x in found.lost)
     yield from (belied_note(e) for e in named if e.hypothesis.key in found.belied)

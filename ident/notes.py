@@ -30,6 +30,9 @@ LOUDER = 1.1  # noise of a joint over that which is given, that is more
 TIE = 0.5  # of the probability of a cause, above which a rival ties with it
 NOT_SOUGHT = "no cause was searched for"
 TIME_UP = "the time for the search was used up before a cause was found"
+WORSE = 1.02  # error of held-out data after over that before, from which it is told what has changed
+CHANGED = 0.01  # of a parameter, from which its change is told
+MOST_CHANGED = 4  # of them that are told
 RIVAL = 0.1  # of the probability of a cause, above which the sentence tells a rival too
 
 
@@ -58,8 +61,8 @@ def sentence(causes: Sequence[Cause], unknown: bool, detected: bool, gain: Gain 
     of_torque = any(c.channel != "q_link" and c.effect != "encoder_quantization" for c in sure)
     closed = (
         ""
-        if gain is None or gain.gap_closed is None or not of_torque
-        else f"; naming {'them' if others else 'it'} closes {min(gain.gap_closed, 1.0):.1%} of the gap to the noise on held-out data"
+        if gain is None or gain.closed_told is None or not of_torque
+        else f"; naming {'them' if others else 'it'} closes {gain.closed_told:.1%} of the gap to the noise on held-out data"
     )
     return f"The simulation misses {names}{closed}{f'; not for sure {possible}' if possible else ''}{rest}."
 
@@ -85,7 +88,8 @@ def told(effect: Effect, structure: Structure, numbers: Mapping[str, float]) -> 
     h = effect.hypothesis
     linear, joints = at_linear_joint(effect, structure), h.options.get("joints", ())
     wave = waves(numbers[RIPPLE], structure.robot.joints[h.joint].gear_ratio, linear) if RIPPLE in numbers else ""
-    return text_at(h.sentence, linear).format(joint=h.place, turned=joints[-1] if joints else "", wave=wave, **numbers)
+    text = h.options["said"](numbers) if "said" in h.options else h.sentence
+    return text_at(text, linear).format(joint=h.place, turned=joints[-1] if joints else "", wave=wave, **numbers)
 
 
 def waves(number: float, gear_ratio: float, linear: bool) -> str:
@@ -141,6 +145,26 @@ def held_out_note(gain: Gain | None) -> tuple[str, ...]:
 def few_note(final: Fit) -> str:
     """Why no name is trusted that is told by next to no data, in a sentence."""
     return f"{final.count} numbers were compared and {len(final.names)} parameters fitted to them: too few for any name to be sure."
+
+
+def refitted_note(baseline: Fit, final: Fit, gain: Gain | None) -> tuple[str, ...]:
+    """What a model without a cause was changed in that predicts held-out data worse, in a sentence; nothing where it does
+    not."""
+    if gain is None or not gain.after > WORSE * gain.before:
+        return ()
+    names = final.names[: len(final.model.par.to_log())]
+    by = np.expm1(final.model.par.to_log() - baseline.model.par.to_log())
+    most = [j for j in np.argsort(-np.abs(by), kind="stable") if abs(by[j]) >= CHANGED][:MOST_CHANGED]
+    changes = [f"{names[j]} by {by[j]:+.3g} times its value" for j in most]
+    added = [
+        f"{e.hypothesis.options['baseline'].replace('_', ' ')} of {e.hypothesis.place}" for e in final.model.effects
+    ]
+    fitted = f"drives fitted again ({', '.join(changes)})" if changes else "drives fitted again, all changed by little"
+    what = f"{fitted} and with {', '.join(added)}" if added else fitted
+    return (
+        f"No cause is named, but the extended model is not the first one: it has its {what}. It predicts held-out data worse,"
+        f" {gain.after:.3g} in place of {gain.before:.3g} {gain.metric.rpartition(', ')[2]}: trust no parameter of it.",
+    )
 
 
 def drift_note(problem: Problem) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ FEWEST_LEVELS, EXACT = 3, 1e-3  # or so many positions at least that lie on the 
 CELLS_PER_STEP = 8  # of the histogram of positions, in the least step
 CLEAR = 10.0  # power of a line over that of white rounding errors, above which it is motion
 SIZES = (0.8, 0.9, 1.1, 1.2)  # of a motion over that which is recorded, at which it is rounded once more
+LEAST_STD = 1e-6  # of a step that is seen exactly: recorders write numbers with so many digits
 CONTRAST = 0.35  # of the sum over samples of exp(2 pi j q / step), relative to its largest value
 
 
@@ -144,7 +145,7 @@ def _exact_grid(q: np.ndarray) -> tuple[float, float] | None:
     few = np.ptp(levels) < LEAST_CELLS * step
     if np.any(off > EXACT) if few else np.mean(off < ON_GRID) < 0.98:
         return None
-    return step, float(step * max(np.sqrt(np.mean(off**2)), 1e-9) / np.ptp(cells))
+    return step, step * max(float(np.sqrt(np.mean(off**2)) / np.ptp(cells)), LEAST_STD)
 
 
 def _blurred_grid(q: np.ndarray, noise: float) -> tuple[float, float] | None:

@@ -125,6 +125,19 @@ class Gain:
         return before, after
 
     @property
+    def closed_told(self) -> float | None:
+        """Share of the gap that is closed as people are told it: no more than all of it. Beyond is chance, by which the
+        error after comes out below the estimate of the noise."""
+        return None if self.gap_closed is None else min(self.gap_closed, 1.0)
+
+    @property
+    def interval_told(self) -> tuple[float, float] | None:
+        """Interval of ``closed_told``; none where it has no width, as of a model that was not extended."""
+        if self.ci95 is None or self.ci95[0] == self.ci95[1]:
+            return None
+        return min(self.ci95[0], 1.0), min(self.ci95[1], 1.0)
+
+    @property
     def of_some(self) -> bool:
         """Whether errors are taken over some of the joints."""
         return 0 < len(self.joints) < len(self.by_joint)

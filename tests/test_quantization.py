@@ -144,3 +144,10 @@ def test_an_error_within_the_steps_of_an_encoder_is_not_trusted():
     assert within(2, 6e-5, -6e-5) and not within(2, 9e-5, 6e-5)
     assert not within(1, 6e-5, -6e-5)
     assert not within_steps(Effect(sensor_lag(2, "joint_2"), np.array([1e-5, 0.0])), steps)
+
+
+def test_a_step_is_known_to_the_digits_of_a_recorder():
+    """However exactly the samples lie on their grid."""
+    q = 8.69e-5 * np.round(np.random.default_rng(0).normal(0.0, 30.0, 4000))
+    step, std = _exact_grid(q)
+    assert step == pytest.approx(8.69e-5, rel=1e-12) and std == pytest.approx(1e-6 * step)

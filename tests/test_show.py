@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -14,7 +15,11 @@ import pytest
 from ident.chain import build_structure
 from ident.cli import _verdict_text
 from ident.graybox import Parameters, equilibrium, linearise, parameter_names
+from ident.hypotheses.friction import friction_drift
 from ident.hypotheses.structure import Change, apply_change
+from ident.model import Effect
+from ident.notes import refitted_note, sentence
+from ident.notes import told as told_of
 from ident.plan import make_plan
 from ident.plan_file import plan_from_toml
 from ident.show.export import build_mjcf, write_model_toml
@@ -439,6 +444,53 @@ def test_the_same_data_are_the_same_picture():
     trace = TorqueTrace("s", t, measured, 0.9 * measured, measured, measured)
     first, again = (trace_figure(trace, ("a",), ("N m",), ("a",)) for _ in range(2))
     assert "url(#" in first and first == again
+
+
+def test_pictures_have_plain_colours_before_those_of_the_page():
+    """For programs that know no variables."""
+    t = np.arange(50.0)
+    trace = TorqueTrace("s", t, *(np.sin(t + x)[:, None] for x in range(4)))
+    figure = trace_figure(trace, ("a",), ("N m",), ("a",))
+    assert "stroke: #c8553d; stroke: var(--before)" in figure and "#0a0b" not in figure
+    assert figure.count("var(--") == len(re.findall(r"([a-z-]+): #\w{6}; \1: var\(--", figure))
+
+
+def test_no_more_than_the_whole_gap_is_told(diagnosis, tmp_path):
+    """By the sentence and the tile alike; verdict.json has what was computed."""
+    gain = replace(diagnosis.verdict.gain, gap_closed=1.044, ci95=(0.18, 1.557))
+    verdict = replace(diagnosis.verdict, gain=gain)
+    assert "closes 100.0% of the gap" in sentence(verdict.causes, False, True, gain)
+    write_report(replace(diagnosis, verdict=verdict), tmp_path / "report.html")
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<b>100.0 %</b>" in html and "95 % interval 18.0 to 100.0 %" in html
+    assert verdict.to_dict()["gain"]["gap_closed"] == 1.044
+    assert replace(gain, gap_closed=-0.09, ci95=(0.0, 0.0)).closed_told == -0.09
+    assert replace(gain, ci95=(0.0, 0.0)).interval_told is None
+
+
+def test_a_model_without_causes_that_predicts_worse_says_what_it_changed(diagnosis):
+    names = tuple(diagnosis.parameters)
+    before = np.zeros(len(names))
+    after = before.copy()
+    after[2], after[5] = np.log(1.5), np.log(0.9)
+    fits = [
+        SimpleNamespace(names=names, model=SimpleNamespace(par=SimpleNamespace(to_log=lambda x=x: x), effects=()))
+        for x in (before, after)
+    ]
+    gain = replace(diagnosis.verdict.gain, before=5.29, after=5.78, metric="RMS error, N m")
+    (note,) = refitted_note(*fits, gain)
+    assert f"({names[2]} by +0.5 times its value, {names[5]} by -0.1 times its value)" in note
+    assert "5.78 in place of 5.29 N m" in note
+    assert refitted_note(*fits, replace(gain, after=5.2)) == () == refitted_note(*fits, None)
+
+
+def test_a_drift_of_a_friction_that_is_all_viscous_tells_no_dry_part():
+    h = friction_drift(0, "drive")
+    structure = SimpleNamespace(robot=load_robot("twomass"))
+    for coulomb, told in ((1e-9, False), (0.2, True)):
+        effect = Effect(h, np.array([0.3, 50.0, coulomb, 1e-3]))
+        numbers = {"relative_change": 0.3, "time_constant": 50.0, "coulomb": coulomb}
+        assert ("Coulomb" in told_of(effect, structure, numbers)) == told
 
 
 def test_figures_leave_the_callers_matplotlib_alone():

@@ -25,6 +25,12 @@ LEAST_TORQUE = 1e-12  # N m
 SHARP = 1e-3  # rad/s, within which a friction turns whose turn the data do not show
 SHARP_SHARE = 2e-3  # the same, over the rms velocity
 LEAST_DIP = 1.15  # static friction over Coulomb's, below which it is as good as that
+NO_FRICTION = 1e-7  # N m, of a friction that is there because its logarithm must be something
+WARMS = (
+    "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant of"
+    " {time_constant:.0f} s"
+)
+DRY_PART = "; {coulomb:.3g} N m of it is Coulomb friction, at the start."
 LEAST_CHANGE = 0.02  # of a friction that drifts, below which it may as well be the error of one that does not
 MOST_DIP = 10.0  # the same, beyond which nothing rubs in motion: no friction of a bearing
 # of the velocity in the fall of a Stribeck friction
@@ -481,10 +487,10 @@ def friction_drift(joint: int, place: str, leads: bool = True) -> Hypothesis:
         law,
         time_constants,
         screen,
-        "The friction of {joint} changes by {relative_change:.0%} over the recording, with a time constant"
-        " of {time_constant:.0f} s; {coulomb:.3g} N m of it is Coulomb friction, at the start.",
+        WARMS + DRY_PART,
         variable="time",
         options={
+            "said": lambda numbers: WARMS + ("." if numbers["coulomb"] < NO_FRICTION else DRY_PART),
             "absorbs": "coulomb_friction",
             "absorb": absorb,
             "apart": "time_constant",

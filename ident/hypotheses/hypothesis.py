@@ -171,6 +171,7 @@ class Hypothesis:
             changes.
             ``winds(plane, solution)``: (S, joints, m) constant torques in the gears, per unit of its parameters, by which
             one of the chain moves the arm to another posture.
+            ``said(numbers)``: the sentence, where values of its parameters by name say which of several it is.
             ``shown`` names the parameter that the data must show for it to be this effect: what never yields is a
             spring.
             ``exceeds``: two positive parameters, of which the first must be larger beyond chance.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ CSS = {
     BEFORE: "var(--before)",
     AFTER: "var(--after)",
 }
+PLAIN = {INK: "#1d2227", SOFT: "#5c6670", GRID: "#dfe2e4", MEASURED: "#4a525a", BEFORE: "#c8553d", AFTER: "#1f7a9c"}
 DARK = {INK: "#e6e8ea", SOFT: "#9aa4ad", GRID: "#34393e", MEASURED: "#b9c1c8", BEFORE: "#e0694e", AFTER: "#3f9fc4"}
 STYLE: dict[RcKeyType, Any] = {
     "font.size": 8,
@@ -105,7 +107,8 @@ def _svg(fig: Figure, bbox: str | None = "tight") -> str:
     fig.savefig(buffer, format="svg", bbox_inches=bbox, transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
     for colour, variable in CSS.items():
-        text = text.replace(colour, variable)
+        # A program that does not know the variable takes the colour before it.
+        text = re.sub(rf"([\w-]+): {colour}", rf"\1: {PLAIN[colour]}; \1: {variable}", text)
     return text[text.index("<svg") :]
 
 

@@ -111,7 +111,7 @@ def _markdown(diagnosis: Diagnosis) -> str:
         ]
     if v.gain is not None:
         g, unit = v.gain, torque_unit(diagnosis.robot, v.gain.joints)
-        ends = g.ci95 if g.ci95 and g.ci95[0] != g.ci95[1] else None  # of a model that was not extended both are 0
+        ends = g.interval_told
         interval = "" if ends is None else f" (95 % interval {ends[0]:.1%} to {ends[1]:.1%} of the gap closed)"
         rows.append(
             f"Torque error on held-out data {g.before:.3g} → {g.after:.3g} {unit}, noise {g.noise_floor:.3g} {unit}{interval}."
@@ -128,18 +128,18 @@ def part(name: str) -> str:
 
 
 def _log_torques(stream: rr.RecordingStream, trace: TorqueTrace, joints: tuple[str, ...]) -> None:
+    """Torques and their errors. The viewer draws in the order of the paths, and the last one, ``after``, on top."""
     step = max(1, len(trace.t) // 4000)
     times = [rr.TimeColumn("time", duration=trace.t[::step])]
+    models = {"before": trace.before, "after": trace.after}
     for j, name in enumerate(joints):
-        for kind, values in (("measured", trace.measured), ("before", trace.before), ("after", trace.after)):
-            entity = f"torque/{part(name)}/{kind}"
-            stream.log(entity, rr.SeriesLines(colors=COLORS[kind], names=kind, widths=1.5), static=True)
-            stream.send_columns(entity, times, rr.Scalars.columns(scalars=values[::step, j]))
-        for kind, values in (("before", trace.before), ("after", trace.after)):
-            entity = f"error/{part(name)}/{kind}"
-            stream.log(entity, rr.SeriesLines(colors=COLORS[kind], names=kind, widths=1.5), static=True)
-            error = (trace.measured - values)[::step, j]
-            stream.send_columns(entity, times, rr.Scalars.columns(scalars=error))
+        torques = {"measured": trace.measured, **models}
+        errors = {kind: trace.measured - values for kind, values in models.items()}
+        for what, curves in (("torque", torques), ("error", errors)):
+            for place, (kind, values) in enumerate(curves.items(), 1):
+                entity = f"{what}/{part(name)}/{place}_{kind}"
+                stream.log(entity, rr.SeriesLines(colors=COLORS[kind], names=kind, widths=1.5), static=True)
+                stream.send_columns(entity, times, rr.Scalars.columns(scalars=values[::step, j]))
 
 
 def _log_arm(stream: rr.RecordingStream, diagnosis: Diagnosis, trace: TorqueTrace) -> None:
