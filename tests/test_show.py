@@ -25,6 +25,7 @@ from ident.plan_file import plan_from_toml
 from ident.show.export import build_mjcf, write_model_toml
 from ident.show.figures import rounded, shown_joints, trace_figure
 from ident.show.outputs import write_outputs
+from ident.show.recording import _log_torques, part
 from ident.show.report import unbroken, write_report
 from ident.simulable import not_simulated, not_simulated_note
 from ident.verdict import (
@@ -444,6 +445,16 @@ def test_the_same_data_are_the_same_picture():
     trace = TorqueTrace("s", t, measured, 0.9 * measured, measured, measured)
     first, again = (trace_figure(trace, ("a",), ("N m",), ("a",)) for _ in range(2))
     assert "url(#" in first and first == again
+
+
+def test_recordings_draw_what_the_extended_model_leaves_on_top(diagnosis):
+    """The viewer draws curves in the order of their paths."""
+    paths = []
+    stream = SimpleNamespace(log=lambda path, *a, **k: paths.append(path), send_columns=lambda *a: None)
+    _log_torques(stream, diagnosis.traces[0], diagnosis.joints)
+    for what, kinds in (("torque", ["measured", "before", "after"]), ("error", ["before", "after"])):
+        of_joint = sorted(p for p in paths if p.startswith(f"{what}/{part(diagnosis.joints[0])}/"))
+        assert [p.rpartition("_")[2] for p in of_joint] == kinds
 
 
 def test_pictures_have_plain_colours_before_those_of_the_page():
