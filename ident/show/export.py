@@ -23,7 +23,7 @@ from ident.verdict import Cause, Diagnosis
 from robot_assets.robot import Elasticity, Robot
 
 TIMESTEP = 2.5e-4  # s, with the Runge-Kutta integrator
-FINE_TIMESTEP = 5e-5  # s, with the implicit integrator: what yields upsets the stages of Runge-Kutta
+FINE_TIMESTEP = 5e-5  # s: for what yields, and for bristles, which upset the stages of Runge-Kutta
 MOST_REFINED = 10  # at most this many times finer where a delay or a lag is shorter than a step
 BRISTLE = 0.7  # frequency of a bristle that stands for a sign, over the step rate, rad
 TIGHT = [0.999, 0.999, 0.001, 0.5, 2.0]  # impedance of dry friction: hardly any creep
@@ -313,14 +313,16 @@ def _stepping(causes: Sequence[Cause], fastest: float) -> tuple[float, mujoco.mj
 
     ``fastest`` is the rate at which a damper stops a rotor, 1/s: beyond the step rate it is for the implicit
     integrator. The force of a bristle in the inner stages of Runge-Kutta runs away where it relaxes within a step
-    and its level changes with velocity, and where a spring yields is kept once a step, whatever its stages saw; the
-    implicit integrator has no such stages. What a spring goes beyond its yield within a step is an error of its
-    force, so that the steps are fine. A filter is stable with Runge-Kutta, and a delay read from past samples alone,
-    where they last longer than a step.
+    and its level changes with velocity; the implicit integrator has no such stages. How far a spring has yielded is
+    kept once a step, whatever the stages saw of it: of a friction that yields this is the larger error, so that it is
+    for the implicit integrator too, and in a gear the smaller one beside what an integrator of first order makes of the
+    gear's spring. Both shrink with the step. A filter is stable with Runge-Kutta, and a delay read from past samples
+    alone, where they last longer than a step.
     """
-    if fastest * TIMESTEP > 1.0 or any(c.effect == "stribeck_friction" or _slips(c) for c in causes):
+    yielding = {c.effect for c in causes if _slips(c)}
+    if fastest * TIMESTEP > 1.0 or yielding - {"hysteresis"} or any(c.effect == "stribeck_friction" for c in causes):
         return FINE_TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    parts = [1.0]
+    parts = [TIMESTEP / FINE_TIMESTEP - 1e-9 if yielding else 1.0]
     for c in causes:
         if c.effect == "torque_delay":
             parts.append(1.5 * TIMESTEP / c.parameters["delay"].value)
