@@ -938,7 +938,7 @@ def test_the_sentence_lists_several_causes(names, told):
     from ident.notes import sentence
     from ident.verdict import Cause
 
-    said = sentence([Cause(e, "a", {}, 0.99, "", ()) for e in names], False, True, SimpleNamespace(gap_closed=0.9))
+    said = sentence([Cause(e, "a", {}, 0.99, "", ()) for e in names], False, True, SimpleNamespace(closed_told=0.9))
     assert said == f"The simulation misses {told} 90.0% of the gap to the noise on held-out data."
 
 
