@@ -118,13 +118,6 @@ def linear_filters(model: Model, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return recorded, true
 
 
-def passed_by_filters(model: Model, s: np.ndarray) -> np.ndarray:
-    """Measured position of a bare motor per recorded torque, over that with neither drives nor sensors that filter; (F,
-    n)."""
-    recorded, true = linear_filters(model, s)
-    return 1.0 / (recorded * true)
-
-
 def predict(
     model: Model,
     group: Group,
@@ -179,7 +172,7 @@ def predict_at(
     if W is not None and W.shape[-1] != structure.n_coordinates:
         W, steps, torques = None, max(steps, REMAINDER_STEPS), Torques()
     filtered = any("filter" in e.hypothesis.options for e in model.effects)
-    Q = true_position(group, par, plane, sampling, partial(passed_by_filters, model) if filtered else None)
+    Q = true_position(structure, par, plane, group, sampling, partial(linear_filters, model) if filtered else None)
     by_channel: dict[str, list[Effect]] = {}
     for effect in model.effects:
         by_channel.setdefault(effect.hypothesis.channel, []).append(effect)

@@ -1,4 +1,4 @@
-"""Gain of an extended model: torque prediction on segments that took part in nothing."""
+"""Gain of an extended model: torque prediction on segments that no model was fitted to."""
 
 from __future__ import annotations
 

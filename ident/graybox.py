@@ -180,7 +180,7 @@ IMAGES = 8
 NEAR_IMAGES = (
     3  # the same, that stiff gears carry to the links; each of the next has a two-hundredth of the first at most
 )
-STIFF = 0.2  # resonance of a motor on its gear over the sample rate, from which it is no bare inertia to them
+STIFF = 0.1  # of a motor on its gear over the sample rate, from which it is no bare inertia to them
 
 
 def hold_response(omega: np.ndarray, sample_time: float, hold: str) -> np.ndarray:
@@ -226,25 +226,38 @@ def alias_response(
 
 
 def stiff_gear_images(
-    structure: Structure, par: Parameters, lin: Linearisation, omega: np.ndarray, sample_time: float, hold: str
+    structure: Structure,
+    par: Parameters,
+    lin: Linearisation,
+    omega: np.ndarray,
+    sample_time: float,
+    hold: str,
+    filters: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> np.ndarray | None:
-    """What ``alias_response`` lacks where gears are stiff: position per recorded torque that each of the nearest images
-    adds beyond that of bare motors; (F, images, n, n) rad/(N m), or None where all gears are soft to them.
+    """What ``alias_response`` lacks where gears are stiff: position per recorded torque that the nearest images add
+    beyond that of bare motors; (F, n, n) rad/(N m), or None where all gears are soft to them.
 
-    A gear whose resonance is above the sample rate turns the link at the images too.
+    A gear whose resonance is above the sample rate turns the link at the images too. From ``STIFF`` to twice that it
+    counts more and more: a fit that passes by meets no step.
+
+    Args:
+        filters: recorded torque per delivered one and true position per measured one at complex frequencies (F,),
+            rad/s; (F, n) each.
     """
-    gears = np.sqrt(np.maximum(par.stiffness / par.inertia, 0.0))
-    if hold == "none" or not np.any(gears > STIFF * 2 * np.pi / sample_time):
+    stiff = np.sqrt(np.max(par.stiffness / par.inertia, initial=0.0)) * sample_time / (2.0 * np.pi)
+    if hold == "none" or stiff <= STIFF:
         return None
-    image = images_of(omega, sample_time, NEAR_IMAGES)
-    far = image.ravel()
-    if lin.M.ndim == 3:  # of a posture at each frequency
-        lin = replace(lin, M=np.repeat(lin.M, image.shape[1], axis=0), Kg=np.repeat(lin.Kg, image.shape[1], axis=0))
-    Y = np.linalg.inv(impedance(structure, par, lin, 1j * far)[0])
+    out = np.zeros((len(omega), structure.n, structure.n), complex)
     k = np.arange(structure.n)
-    Y[:, k, k] += 1.0 / (far[:, None] ** 2 * par.inertia)
-    more = hold_response(far, sample_time, hold)[:, None, None] * Y
-    return more.reshape(*image.shape, structure.n, structure.n)
+    for image in images_of(omega, sample_time, NEAR_IMAGES).T:  # one at a time: all would take several times the room
+        Y = np.linalg.inv(impedance(structure, par, lin, 1j * image)[0])
+        Y[:, k, k] += 1.0 / (image[:, None] ** 2 * par.inertia)
+        Y *= hold_response(image, sample_time, hold)[:, None, None]
+        if filters is not None:
+            recorded, true = filters(1j * image)
+            Y /= true[:, :, None] * recorded[:, None, :]
+        out += Y
+    return min(stiff / STIFF - 1.0, 1.0) * out
 
 
 def images_of(omega: np.ndarray, sample_time: float, most: int) -> np.ndarray:
@@ -321,7 +334,7 @@ def sampled_frf(
     G[:, k, k] += (s**2 * alias)[:, None] / par.inertia
     more = stiff_gear_images(structure, par, lin, omega, sample_time, hold)
     if more is not None:
-        G += (s**2)[:, None, None] * np.sum(more, axis=1)
+        G += (s**2)[:, None, None] * more
     if not derivatives:
         return G, None
     left, right = impedance_derivatives(structure, par, s, A_inv, C)

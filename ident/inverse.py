@@ -24,14 +24,12 @@ import scipy.fft
 from ident.chain import Structure
 from ident.columns import Products
 from ident.graybox import (
-    NEAR_IMAGES,
     Linearisation,
     Parameters,
     alias_response,
     damping_diagonal,
     equilibrium,
     hold_response,
-    images_of,
     impedance,
     linearise,
     rotor_inertia,
@@ -84,7 +82,6 @@ class Plane:
         link_per_position: (L, M, n) motion of the links whose encoders are compared per motor position.
         link_per_spring: (L, M, n) rad per N m in parallel with a spring.
         link_per_load: (L, M, N) rad per N m that opposes on a link coordinate.
-        images: (L, images, n, n) as of ``stiff_gear_images``, or None.
     """
 
     lin: Linearisation
@@ -99,7 +96,6 @@ class Plane:
     link_per_position: np.ndarray
     link_per_spring: np.ndarray
     link_per_load: np.ndarray
-    images: np.ndarray | None = None
 
     @cached_property
     def differences(self) -> tuple[np.ndarray, np.ndarray]:
@@ -134,8 +130,7 @@ class Plane:
 def make_plane(structure: Structure, par: Parameters, group: Group, sampling: Sampling) -> Plane:
     """Linearise a group at its own parameter-dependent equilibrium."""
     lin = linearise(structure, equilibrium(structure, par, group.posture))
-    images = stiff_gear_images(structure, par, lin, group.omega, sampling.sample_time, sampling.hold)
-    return replace(plane_at(structure, par, lin, group, torque_record(par, group, sampling)), images=images)
+    return plane_at(structure, par, lin, group, torque_record(par, group, sampling))
 
 
 def torque_record(par: Parameters, group: Group, sampling: Sampling) -> np.ndarray:
@@ -166,25 +161,29 @@ def plane_at(structure: Structure, par: Parameters, lin: Linearisation, group: G
 
 
 def true_position(
-    group: Group,
+    structure: Structure,
     par: Parameters,
     plane: Plane,
+    group: Group,
     sampling: Sampling,
-    passed: Callable[[np.ndarray], np.ndarray] | None = None,
+    filters: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> np.ndarray:
     """Motor position without what the images of the held torque add; (S, L, n) rad, that of the group itself where none
-    is held. ``passed`` as of ``alias_response``."""
+    is held. ``filters`` as of ``stiff_gear_images``."""
     if sampling.hold == "none":
         return group.Q
-    alias = alias_response(group.omega, sampling.sample_time, sampling.hold, passed).reshape(len(group.omega), -1)
+
+    def passed(s: np.ndarray) -> np.ndarray:
+        recorded, true = filters(s) if filters is not None else (1.0, 1.0)
+        return np.asarray(1.0 / (recorded * true))
+
+    held = sampling.sample_time, sampling.hold
+    alias = alias_response(group.omega, *held, passed if filters is not None else None).reshape(len(group.omega), -1)
     Q = group.Q - alias * group.U / par.inertia
-    if plane.images is None:
+    if group.steps is not None:  # such a step holds no torque itself
         return Q
-    if passed is None:
-        return Q - np.einsum("lij,slj->sli", np.sum(plane.images, axis=1), group.U)
-    image = images_of(group.omega, sampling.sample_time, NEAR_IMAGES)
-    share = passed(1j * image.ravel()).reshape(*image.shape, -1)
-    return Q - np.einsum("lmij,lmj,slj->sli", plane.images, share, group.U, optimize=True)
+    images = stiff_gear_images(structure, par, plane.lin, group.omega, *held, filters)
+    return Q if images is None else Q - np.einsum("lij,slj->sli", images, group.U)
 
 
 def drifting_torque(Z: np.ndarray, drift: np.ndarray) -> np.ndarray:
@@ -267,7 +266,7 @@ def solve(
         FloatingPointError: the motion of the links runs away, beside steps enough to solve it.
     """
     if Q is None:
-        Q = true_position(group, par, plane, sampling)
+        Q = true_position(structure, par, plane, group, sampling)
     enough = NEAR_CHANGE
     if W is None:
         W, enough = static_remainder(structure, par, plane, group), REMAINDER_CHANGE

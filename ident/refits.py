@@ -56,7 +56,13 @@ def polish(problem: Problem, result: Fit) -> Fit:
     """The winner fitted to the end, under the noise that it sees itself."""
     found = _to_the_end(problem, result)
     anew = with_drives_anew(problem, found)
-    return found if anew is found else _to_the_end(problem, anew)
+    if anew is found:
+        return found
+    try:
+        other = _to_the_end(problem, anew)
+        return other if other.cost < reweighted(problem, found, other.weights).cost else found
+    except NOT_COMPUTED:
+        return found
 
 
 def _to_the_end(problem: Problem, result: Fit) -> Fit:

@@ -151,6 +151,8 @@ def begun_anew(
     problem: Problem, ranked: Sequence[tuple[Hypothesis, Fit]], workers: Workers
 ) -> list[tuple[Hypothesis, Fit]]:
     """Candidates of which the first are ``with_drives_anew``, best first."""
+    if all(r.chi2_per_dof <= FAINT for _, r in ranked[:FINALISTS]):
+        return list(ranked)
     new = workers.map_in_time(lambda x: with_drives_anew(problem, x[1]), ranked[:FINALISTS])
     fits = [r if n is None or last_is_pointless(n) else n for n, (_, r) in zip(new, ranked[:FINALISTS], strict=True)]
     first = [(h, r) for (h, _), r in zip(ranked[:FINALISTS], fits, strict=True)]

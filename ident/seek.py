@@ -81,7 +81,7 @@ def seek(
     recorded = setup.problem.groups
     linked = None if mislabelled else by_link_encoders(dataset, setup, baseline, max_causes, workers)
     if linked is not None and explained(linked.result):
-        return replace(gone_on_with(linked, max_causes, workers), late=workers.late)
+        return gone_on_with(linked, max_causes, workers)
     foretell = not mislabelled and setup.problem.motions_alone and inertias_foretell(setup)
     first_search = workers.for_half() if foretell else workers  # causes are then sought beside these inertias too
     guess = setup.problem.tau_std
@@ -94,7 +94,7 @@ def seek(
     found = Sought(setup, recorded, baseline, result, setup.problem.nominal, late=first_search.late)
     if foretell and unresolved(result) and not workers.late:
         return with_inertias(found, max_causes, workers)
-    return replace(gone_on_with(found, max_causes, workers), late=workers.late)
+    return gone_on_with(found, max_causes, workers)
 
 
 def gone_on_with(found: Sought, max_causes: int, workers: Workers) -> Sought:
@@ -107,7 +107,7 @@ def gone_on_with(found: Sought, max_causes: int, workers: Workers) -> Sought:
         )
     except NOT_COMPUTED:
         return found
-    return replace(found, result=result)
+    return replace(found, result=result, late=workers.late)
 
 
 def sought(

@@ -34,6 +34,7 @@ CLOSED = 0.5  # share of the gap that the extended model must then close
 CARRIED = 0.8  # the same where it explains the data that it was fitted to down to the noise
 ABOVE_NOISE = 1.5  # held-out error of the extended model over the noise, from which it has not carried over
 SHORT = 0.25  # by which the gap closed on held-out data may fall short of what the fitted ones promise
+COMES_ROUND = 1.25  # times that a ripple must come round along the path of its joint beside a spring there
 FEWEST_PERIODS = 5.0  # of a ripple that motions must show in the compared band for its name to be trusted
 SHADOW_OF_LAW = 0.05  # of what a law explains, below which a second one of the same element is not trusted
 HARMONIC = 0.1  # the same of a ripple at a multiple of the periods of another one
@@ -205,7 +206,7 @@ def too_fast(problem: Problem, predictions: Sequence[Prediction], effect: Effect
 
 
 def piece_of_a_curve(effect: Effect, final: Fit, predictions: Sequence[Prediction]) -> bool:
-    """Whether an effect is a ripple beside a spring to the link, which does not come round along all that its joint
+    """Whether an effect is a ripple beside a spring to the link, which hardly comes round along all that its joint
     moves; or the spring, where both leave more than noise there.
 
     A line and a part of a wave draw nearly any torque over the position, and where they miss it is none of theirs.
@@ -217,7 +218,7 @@ def piece_of_a_curve(effect: Effect, final: Fit, predictions: Sequence[Predictio
     springs = [e for e in at_joint if e.hypothesis.effect in SPRINGS]
     ends = [(q.min(), q.max()) for q in (pred.motion().q(j) for pred in predictions)]
     path = max(top for _, top in ends) - min(bottom for bottom, _ in ends)
-    parts = [e for e in at_joint if e.hypothesis.repeats and e.value(RIPPLE) * path < 2.0 * np.pi]
+    parts = [e for e in at_joint if e.hypothesis.repeats and e.value(RIPPLE) * path < COMES_ROUND * 2.0 * np.pi]
     misses = final.costs[j] > LEFT_ERROR * final.counts[j]
     doubted = [*parts, *(springs if misses else ())]
     return bool(springs and parts) and any(e is effect for e in doubted)

@@ -8,7 +8,16 @@ import pytest
 import scipy.linalg
 
 from ident.chain import LinkChange, build_structure
-from ident.graybox import Parameters, alias_response, equilibrium, hold_response, linearise, sampled_frf
+from ident.graybox import (
+    STIFF,
+    Parameters,
+    alias_response,
+    equilibrium,
+    hold_response,
+    linearise,
+    sampled_frf,
+    stiff_gear_images,
+)
 from ident.hypotheses import catalogue
 from ident.inverse import make_plane, true_position
 from robot_assets.robot import Elasticity, load_robot
@@ -78,21 +87,46 @@ def test_sampling_is_exact(ur10, stiffer):
 
 
 def test_motion_is_told_from_images_as_the_response_has_them(identified):
-    """``true_position`` takes away what ``sampled_frf`` adds to the response in the band, on stiff gears too."""
+    """``true_position`` takes away what ``sampled_frf`` adds to the response in the band, on stiff gears too; with
+    filters what of them passes the drive of one joint and the sensor of another."""
     problem = identified[1].problem
-    sampling, group = problem.sampling, problem.groups[0]
+    structure, sampling, group = problem.structure, problem.sampling, problem.groups[0]
     for stiffer in (1.0, 1e4):
         par = replace(problem.nominal, stiffness=stiffer * problem.nominal.stiffness)
-        plane = make_plane(problem.structure, par, group, sampling)
-        assert (plane.images is None) == (stiffer == 1.0)
-        f = group.omega[1:] / 2 / np.pi
-        G = sampled_frf(problem.structure, par, plane.lin, f, sampling.sample_time, "zoh")[0]
-        band = hold_response(group.omega[1:], sampling.sample_time, "zoh")[:, None, None] * np.linalg.inv(plane.Z[1:])
-        images = np.einsum("lij,slj->sli", -G / group.omega[1:, None, None] ** 2 - band, group.U[:, 1:])
-        found = (group.Q - true_position(group, par, plane, sampling))[:, 1:]
+        plane = make_plane(structure, par, group, sampling)
+        omega = group.omega[1:]
+        G = sampled_frf(structure, par, plane.lin, omega / 2 / np.pi, sampling.sample_time, "zoh")[0]
+        band = hold_response(omega, sampling.sample_time, "zoh")[:, None, None] * np.linalg.inv(plane.Z[1:])
+        images = np.einsum("lij,slj->sli", -G / omega[:, None, None] ** 2 - band, group.U[:, 1:])
+        found = (group.Q - true_position(structure, par, plane, group, sampling))[:, 1:]
         assert np.abs(found - images).max() < 1e-6 * np.abs(images).max()
-        alone = true_position(group, par, plane, sampling, lambda s: np.ones((len(s), problem.structure.n)))
-        assert np.allclose(group.Q[:, 1:] - alone[:, 1:], found, rtol=1e-6, atol=1e-12 * np.abs(found).max())
+    gains = np.arange(1.0, 7.0), np.arange(2.0, 8.0)
+    filtered = true_position(
+        structure,
+        par,
+        plane,
+        group,
+        sampling,
+        lambda s: (np.tile(gains[0], (len(s), 1)), np.tile(gains[1], (len(s), 1))),
+    )
+    share = np.einsum("lij,slj->sli", -G / omega[:, None, None] ** 2 - band, group.U[:, 1:] / gains[0]) / gains[1]
+    # Of bare motors behind filters eight images are summed, not all.
+    assert np.abs((group.Q - filtered)[:, 1:] - share).max() < 2e-3 * np.abs(share).max()
+
+
+def test_images_of_a_gear_that_grows_stiff_come_by_and_by(ur10):
+    structure, par, T = build_structure(ur10), Parameters.nominal(ur10), 8e-3
+    lin = linearise(structure, equilibrium(structure, par, Q0))
+    gears = np.max(np.sqrt(par.stiffness / par.inertia)) * T / 2 / np.pi
+    omega = 2 * np.pi * np.linspace(1.0, 40.0, 20)
+
+    def at(ratio):
+        by = (ratio * STIFF / gears) ** 2
+        return stiff_gear_images(structure, replace(par, stiffness=by * par.stiffness), lin, omega, T, "zoh")
+
+    assert at(0.99) is None
+    assert 0.0 < np.abs(at(1.001)).max() < 2e-3 * np.abs(at(2.0)).max()
+    assert np.abs(at(2.001) - at(1.999)).max() < 0.05 * np.abs(at(2.0)).max()
 
 
 def test_a_stiff_hinge_changes_nothing_and_a_soft_one_adds_a_resonance(ur10):

@@ -36,7 +36,7 @@ def test_links_on_lightly_damped_gears_are_solved_along_large_motions(clean, mon
     light = replace(problem.nominal, damping=share * problem.nominal.damping)
     structure, par = Model(problem.structure, light).built
     plane = make_plane(structure, par, group, problem.sampling)
-    large = true_position(group, par, plane, problem.sampling).copy()
+    large = true_position(structure, par, plane, group, problem.sampling).copy()
     large[:, 1:] *= larger
     found = solve(structure, par, plane, group, problem.sampling, Q=large, steps=REMAINDER_STEPS)
     assert len(looks) < 60
@@ -90,7 +90,7 @@ def test_derivatives_follow_links_whose_motion_took_the_links_along_it_to_find(c
     problem = set_up(clean[0]).problem
     group = next(g for g in problem.groups if g.window is None).pick(np.arange(2))
     plane = make_plane(problem.structure, problem.nominal, group, problem.sampling)
-    Q = true_position(group, problem.nominal, plane, problem.sampling).copy()
+    Q = true_position(problem.structure, problem.nominal, plane, group, problem.sampling).copy()
     Q[:, 1:] *= 30.0
     group = replace(group, Q=Q)
     model = Model(problem.structure, replace(problem.nominal, damping=0.3 * problem.nominal.damping))

@@ -185,13 +185,15 @@ def test_a_few_segments_of_a_group_keep_their_order(clean_drive):
 def test_joints_and_noise_are_those_of_the_verdict_beside_the_file(tmp_path):
     """Of the segments that it speaks of, and on no others."""
     gain = {"segments": ["a", "b"], "joints": ["x"], "by_joint": {"x": {"noise_floor": 0.5}, "y": {"noise_floor": 2.0}}}
-    (tmp_path / "verdict.json").write_text(json.dumps({"gain": gain}))
+    (tmp_path / "verdict.json").write_text(json.dumps({"dataset": "d", "gain": gain}))
     file = tmp_path / "model.xml"
-    assert gain_beside(file, ("x", "y"), ["b"]) == gain
-    assert gain_beside(file, ("x", "y"), ["c"]) is None and gain_beside(file, ("x", "z"), ["a"]) is None
-    (tmp_path / "verdict.json").write_text(json.dumps({"gain": None}))
-    assert gain_beside(file, ("x", "y"), ["a"]) is None
-    assert gain_beside(tmp_path / "elsewhere" / "model.xml", ("x", "y"), ["a"]) is None
+    assert gain_beside(file, "d", ("x", "y"), ["b"]) == gain
+    assert gain_beside(file, "another", ("x", "y"), ["b"]) is None
+    assert gain_beside(file, "d", ("x", "y"), ["c"]) is None and gain_beside(file, "d", ("x", "z"), ["a"]) is None
+    for other in (None, {k: v for k, v in gain.items() if k != "joints"}, {**gain, "by_joint": {"x": {}, "y": {}}}):
+        (tmp_path / "verdict.json").write_text(json.dumps({"dataset": "d", "gain": other}))
+        assert gain_beside(file, "d", ("x", "y"), ["a"]) is None
+    assert gain_beside(tmp_path / "elsewhere" / "model.xml", "d", ("x", "y"), ["a"]) is None
 
 
 def test_what_a_window_leaves_out_is_not_drawn(clean_drive):

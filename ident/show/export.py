@@ -259,7 +259,7 @@ def _element(spec: mujoco.MjSpec, index: int, cause: Cause, turned: str) -> str:
     Args:
         turned: joint that a coupled one turns too.
     """
-    named = re.compile(rf"[a-z]+:{index}(\..+)?")
+    named = re.compile(rf"(passive|slip|friction|spring|encoder):{index}(\..+)?")
     own = [x.name for x in (*spec.actuators, *spec.tendons, *spec.sensors) if named.fullmatch(x.name)]
     p = {k: v.value for k, v in cause.parameters.items()}
     shared = ELEMENTS.get(cause.effect, "").format(place=cause.joint, effect=cause.effect, index=index, turned=turned)

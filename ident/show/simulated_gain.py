@@ -74,7 +74,7 @@ def simulated_gain(
     problem = setup.problem
     groups = tuple(g.pick(spread(len(g.segments), segments)) for g in setup.held_out)
     joints = problem.structure.robot.joint_names
-    told = gain_beside(model, joints, [name for g in groups for name in g.segments])
+    told = gain_beside(model, dataset.name, joints, [name for g in groups for name in g.segments])
     if told is None:
         affected = affected_joints(problem, baseline, predictions(problem, baseline.model, baseline.remainders))
     else:
@@ -93,15 +93,18 @@ def simulated_gain(
 
 
 def gain_beside(
-    model: str | Path | mujoco.MjSpec, joints: Sequence[str], segments: Sequence[str]
+    model: str | Path | mujoco.MjSpec, dataset: str, joints: Sequence[str], segments: Sequence[str]
 ) -> dict[str, Any] | None:
-    """The gain of the ``verdict.json`` in the folder of a file, as it is written; None where there is none on these
-    joints and segments."""
+    """The gain of the ``verdict.json`` in the folder of a file, as it is written; None where there is none of this
+    dataset, on these joints and segments."""
     if isinstance(model, mujoco.MjSpec):
         return None
     try:
-        gain = json.loads(Path(model).with_name("verdict.json").read_text(encoding="utf-8"))["gain"]
-        fits = set(gain["by_joint"]) == set(joints) and set(segments) <= set(gain["segments"])
+        verdict = json.loads(Path(model).with_name("verdict.json").read_text(encoding="utf-8"))
+        gain = verdict["gain"]
+        fits = verdict["dataset"] == dataset and set(gain["joints"]) <= set(joints)
+        fits = fits and set(gain["by_joint"]) == set(joints) and set(segments) <= set(gain["segments"])
+        fits = fits and all(float(x["noise_floor"]) >= 0.0 for x in gain["by_joint"].values())
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return gain if fits else None
