@@ -67,8 +67,14 @@ def rivals_of(found: Round, there: Collection[tuple[str, str]]) -> list[Candidat
     """
     if found.candidates[0].hypothesis.gear_law:
         return []
-    others = (c for c in found.candidates[1:] if c.hypothesis.key not in there and not c.hypothesis.gear_law)
-    return sorted((c for c in others if c.probability > REMATCH), key=lambda c: -c.probability)[:FINALISTS]
+    others = (c for c in found.candidates[1:] if c.probability > REMATCH and not c.hypothesis.gear_law)
+    # One that was renamed since, or of which nothing was left, is not in its own fit.
+    fitted = [
+        c
+        for c in others
+        if c.hypothesis.key not in there and c.hypothesis.key in {e.hypothesis.key for e in c.fit.model.effects}
+    ]
+    return sorted(fitted, key=lambda c: -c.probability)[:FINALISTS]
 
 
 def _weighed(

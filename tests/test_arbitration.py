@@ -182,6 +182,8 @@ def test_laws_of_the_gear_are_not_weighed_so(friction):
     found = led_by(friction[3], "coulomb_friction", 0.6)
     assert [c.hypothesis.effect for c in rivals_of(found, ())] == ["stribeck_friction"]
     assert rivals_of(found, [("stribeck_friction", "elbow_joint")]) == []  # nor one that is there already
+    own, other = found.candidates
+    assert rivals_of(replace(found, candidates=(own, replace(other, fit=own.fit))), ()) == []  # or not in its own fit
     gear = [
         replace(c, hypothesis=backlash(2, "elbow_joint", 1e-3) if i == at else c.hypothesis)
         for at in (0, 1)
