@@ -356,6 +356,12 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
     assert shadowed(rub, (cable, rub)) is (left < 50.0)  # a cable rubs by itself, and its law lacks some of that
 
 
+def a_round(h, before, after):
+    """That a cause has won, of costs that are the same at six joints, of a thousand numbers each."""
+    fits = [SimpleNamespace(costs=np.full(6, x), counts=np.full(6, 1000.0)) for x in (before, after)]
+    return Round(fits[0], (Candidate(h, fits[1], 0.0),), (), 1.0, 1.0)
+
+
 @pytest.mark.parametrize(
     ("second", "left", "expected"),
     [("friction_drift", 1.05, False), ("friction_drift", 1.5, True), ("coulomb_friction", 1.05, True)],
@@ -363,12 +369,8 @@ def test_a_second_law_that_explains_next_to_nothing_beside_the_first_is_its_shad
 def test_a_weak_drift_of_friction_beside_another_law_is_none_of_its_errors_where_nothing_is_left(
     named, second, left, expected
 ):
-    def round_of(h, before, after):
-        fits = [SimpleNamespace(costs=np.full(6, x), counts=np.full(6, 1000.0)) for x in (before, after)]
-        return Round(fits[0], (Candidate(h, fits[1], 0.0),), (), 1.0, 1.0)
-
-    by_load = round_of(named["load_dependent_friction", "elbow_joint"], 1e5, 1000.0 * left + 2000.0)
-    weak = round_of(named[second, "elbow_joint"], 1000.0 * left + 2000.0, 1000.0 * left)
+    by_load = a_round(named["load_dependent_friction", "elbow_joint"], 1e5, 1000.0 * left + 2000.0)
+    weak = a_round(named[second, "elbow_joint"], 1000.0 * left + 2000.0, 1000.0 * left)
     assert shadowed(weak, (by_load, weak)) is expected
 
 
@@ -377,12 +379,8 @@ def test_a_weak_drift_of_friction_beside_another_law_is_none_of_its_errors_where
     [("torque_saturation", 1.05, False), ("torque_saturation", 1.5, True), ("torque_delay", 1.05, True)],
 )
 def test_what_bends_and_leaves_nothing_is_not_what_a_filter_lacks(named, second, left, expected):
-    def round_of(h, before, after):
-        fits = [SimpleNamespace(costs=np.full(6, x), counts=np.full(6, 1000.0)) for x in (before, after)]
-        return Round(fits[0], (Candidate(h, fits[1], 0.0),), (), 1.0, 1.0)
-
-    lag = round_of(named["sensor_lag", "elbow_joint"], 1e9, 1000.0 * left + 2000.0)
-    other = round_of(named[second, "elbow_joint"], 1000.0 * left + 2000.0, 1000.0 * left)
+    lag = a_round(named["sensor_lag", "elbow_joint"], 1e9, 1000.0 * left + 2000.0)
+    other = a_round(named[second, "elbow_joint"], 1000.0 * left + 2000.0, 1000.0 * left)
     assert shadowed(other, (lag, other)) is expected
 
 
