@@ -31,6 +31,7 @@ NUMBERS, MOST_SEGMENTS = 4.0, 4
 ALIKE = 0.1  # logarithm of the ratio of two mean squared errors of a segment, within which they say nothing
 ABOVE = 2.0  # error, as power, of either model over the noise, from which a segment says anything
 LEAST = 1e-300  # N2 m2
+SURE = 50.0  # nats, at most
 SPOKEN = 1.0  # nats by which held-out data must move the odds of a rival to be told
 
 
@@ -122,7 +123,15 @@ def _weighed(
     lines.append(
         "They have chosen between these, so that the gain which is measured on them is that of the better one."
     )
-    return beside_its_error(problem, polish(problem, fits[id(best)])), weighed, lines
+    return settled_in(problem, fits[id(best)]), weighed, lines
+
+
+def settled_in(problem: Problem, rival: Fit) -> Fit:
+    """The model with a rival that has won, fitted to the end; as it is where that fails."""
+    try:
+        return beside_its_error(problem, polish(problem, rival))
+    except NOT_COMPUTED:
+        return rival
 
 
 def with_rival(model: Model, own: Candidate, rival: Candidate) -> Model:
@@ -160,11 +169,11 @@ def nats_for(rival: Errors, own: Errors, joints: Sequence[int] | None = None) ->
     told = np.mean(np.where(np.maximum(a, b) > ABOVE * noise, beyond, 0.0), axis=0)
     seen = told if joints is None else told[list(joints)]
     most = seen[int(np.argmax(np.abs(seen)))]
-    return float(0.5 * NUMBERS * min(len(segments), MOST_SEGMENTS) * most)
+    return float(np.clip(0.5 * NUMBERS * min(len(segments), MOST_SEGMENTS) * most, -SURE, SURE))
 
 
 def line(own: Candidate, rival: Candidate, nats: float) -> str:
     """What held-out data say of two causes."""
     names = [f"{c.hypothesis.effect} at {c.hypothesis.place}" for c in (own, rival)]
     better, worse = names[::-1] if nats > 0.0 else names
-    return f"Held-out data speak for {better} against {worse}, by a factor of {np.exp(min(abs(nats), 50.0)):.3g} in the odds."
+    return f"Held-out data speak for {better} against {worse}, by a factor of {np.exp(abs(nats)):.3g} in the odds."

@@ -10,6 +10,7 @@ from ident.arbitration import (
     ALIKE,
     MOST_SEGMENTS,
     NUMBERS,
+    SURE,
     joints_of,
     nats_for,
     rivals_of,
@@ -59,6 +60,7 @@ def errors(left, noise=1.0, names=None):
         ([[3.0], [4.0]], [[4.0], [3.0]], 0.0),  # now the one, now the other
         ([[3.0], [3.0]], [[3.27], [3.27]], 0.0),
         ([[1.0], [1.5]], [[0.5], [0.5]], 0.0),  # noise
+        ([[3.0], [3.0]], [[0.0], [0.0]], SURE),
     ],
 )
 def test_held_out_errors_speak_for_the_model_that_leaves_less(own, rival, expected):
@@ -72,9 +74,9 @@ def test_stretches_of_a_motion_count_as_one_segment():
 
 
 def test_joints_at_which_neither_cause_sits_say_nothing():
-    own, rival = errors([[100.0, 1e6]] * 4), errors([[10.0, 1e3]] * 4)
+    own, rival = errors([[100.0, 1e6]] * 4), errors([[10.0, 1e4]] * 4)
     assert nats_for(rival, own, (0,)) == pytest.approx(2.0 * NUMBERS * (np.log(10.0) - ALIKE))
-    assert nats_for(rival, own) == pytest.approx(2.0 * NUMBERS * (np.log(1000.0) - ALIKE))
+    assert nats_for(rival, own) == pytest.approx(2.0 * NUMBERS * (np.log(100.0) - ALIKE))
     joint, chain = (Candidate(SimpleNamespace(joint=j, on_chain=on), None, 0.0) for j, on in ((2, False), (1, True)))
     assert joints_of(joint, joint) == (2,) and joints_of(joint, chain) is None
 
