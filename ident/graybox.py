@@ -177,9 +177,8 @@ def damping_diagonal(structure: Structure, par: Parameters) -> np.ndarray:
 # of a held torque on either side, that drives and sensors may change; each of the next has a seven-hundredth of the
 # first at most
 IMAGES = 8
-NEAR_IMAGES = (
-    3  # the same, that stiff gears carry to the links; each of the next has a two-hundredth of the first at most
-)
+# the same, that stiff gears carry to the links; each of the next has a two-hundredth of the first at most
+NEAR_IMAGES = 3
 STIFF = 0.1  # of a motor on its gear over the sample rate, from which it is no bare inertia to them
 
 

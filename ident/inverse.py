@@ -172,13 +172,9 @@ def true_position(
     is held. ``filters`` as of ``stiff_gear_images``."""
     if sampling.hold == "none":
         return group.Q
-
-    def passed(s: np.ndarray) -> np.ndarray:
-        recorded, true = filters(s) if filters is not None else (1.0, 1.0)
-        return np.asarray(1.0 / (recorded * true))
-
     held = sampling.sample_time, sampling.hold
-    alias = alias_response(group.omega, *held, passed if filters is not None else None).reshape(len(group.omega), -1)
+    passed = None if filters is None else lambda s: 1.0 / np.prod(filters(s), axis=0)
+    alias = alias_response(group.omega, *held, passed).reshape(len(group.omega), -1)
     Q = group.Q - alias * group.U / par.inertia
     if group.steps is not None:  # such a step holds no torque itself
         return Q

@@ -279,7 +279,8 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
     top = min(int(band_hz * N / fs), N // 2 - 1)
     white_noise = difference_noise(segment.q) ** 2 / N
     least, most = (min(int(band * top) + 2, N // 2) for band in (MOTION_BAND, FAST_BAND))
-    n_slow = lines_of_motion(_lines(q[None], N // 2)[0], white_noise, least, most)
+    whole = _lines(q[None], N // 2)
+    n_slow = lines_of_motion(whole[0], white_noise, least, most)
     n_lines = most if fast else n_slow
     # A ripple is fast along a motion that is slow: on a grid of the compared band alone it would fold into it.
     fine = min(N, scipy.fft.next_fast_len(int(MOTION_RATE * N / fs), real=True))
@@ -291,12 +292,12 @@ def _motion_group(dataset: Dataset, segment: Segment, band_hz: float, fast: bool
     window = np.clip(time / ramp, 0, 1) * np.clip((end - time) / ramp, 0, 1)
     window = np.sin(0.5 * np.pi * window) ** 2
     U = _lines(tau[None], n_lines)
-    Q = _lines(q[None], n_lines)
+    Q = whole[:, :n_lines].copy()  # not as a part of all lines, which would stay
     link = None
     if segment.q_link is not None:
         link = _lines(close_motion(segment.q_link, n_return, fs, curvature=True)[None], n_lines)
     # Dry friction turns where the velocity does: of that the compared lines alone know to hundredths of a second.
-    beyond = _lines(q[None], min(N // 2, (n_time + 1) // 2))[None, :, n_lines:]
+    beyond = whole[None, :, n_lines : (n_time + 1) // 2]
     group = Group(
         operating_point=segment.operating_point or segment.name,
         segments=(segment.name,),
